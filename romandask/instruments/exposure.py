@@ -1,0 +1,133 @@
+"""What an exposure is, and the interface that every telescope offers to the stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal, Protocol
+
+import numpy as np
+import pandas as pd
+from astropy.wcs import WCS
+from scipy.interpolate import RectBivariateSpline
+
+from romandask.kernels.detector import Detector
+from romandask.kernels.psf import PsfBasis
+from romandask.model.sky import Region
+from romandask.model.spectra import Bandpass
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One detector of one visit."""
+
+    visit: int
+    detector: int
+    band: str
+    mjd: float
+    """Start, days."""
+    exptime: float
+    """Seconds."""
+    ra: float
+    """Boresight (Roman: centre of the focal plane), degrees."""
+    dec: float
+    """Degrees."""
+    pa: float
+    """Position angle of the focal plane's +y axis, degrees east of north."""
+    seeing: float = np.nan
+    """Atmospheric FWHM at 500 nm and zenith, arcsec; NaN in space."""
+    airmass: float = np.nan
+    sky_brightness: float = np.nan
+    """AB mag / arcsec2; NaN in space."""
+
+    @property
+    def name(self) -> str:
+        """Unit name: band, visit and detector."""
+        return f"{self.band}-{self.visit}-{self.detector}"
+
+
+EXPOSURE_COLUMNS = tuple(field.name for field in fields(Exposure))
+
+
+def exposure_of(row: pd.Series) -> Exposure:
+    """Return the exposure of a row of a pointings table."""
+    kinds = {"visit": int, "detector": int, "band": str}
+    return Exposure(**{name: kinds.get(name, float)(row[name]) for name in EXPOSURE_COLUMNS})
+
+
+class Instrument(Protocol):
+    """A telescope and its camera, as the stages see it; one file a telescope."""
+
+    name: str
+    coadd_scale: float
+    """Pixel scale of its coadds, arcsec."""
+    pixel_scale: float
+    """Native, arcsec."""
+    shape: tuple[int, int]
+    """Detector (ny, nx)."""
+    knot_smoothing: float
+    """Sigma, arcsec, of the Gaussian that smooths knots of galaxies."""
+    detector: Detector
+    detection: Literal["median", "mean"]
+    """How bands are combined to the detection image."""
+    detection_bands: tuple[str, ...] | None
+    """Bands that enter it; None for all."""
+    coadd_from: Literal["exposures", "pointings"]
+    """Whether coadds are resampled from exposures or drawn directly from the cadence."""
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Bands of this pipeline."""
+
+    def bandpass(self, band: str) -> Bandpass:
+        """Return a bandpass, with the wavelengths at which the PSF is known."""
+
+    def plan(self, region: Region, seed: int) -> pd.DataFrame:
+        """Return visits that cover a region: the columns of Exposure without the detector."""
+
+    def headers(self, exposure: Exposure) -> dict[int, dict]:
+        """Return the exact FITS header of every detector of a visit."""
+
+    def header(self, exposure: Exposure) -> dict:
+        """Return the exact FITS header of an exposure."""
+
+    def psf(self, exposure: Exposure, size: int) -> PsfBasis:
+        """Return the chromatic PSF of an exposure for stamps up to `size` pixels."""
+
+    def background(self, exposure: Exposure, header: dict) -> np.ndarray:
+        """Return the expected electrons (ny, nx) that do not come from objects."""
+
+    def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
+        """Return the noise of an empty pixel, electrons rms."""
+
+
+def footprint(header: dict, shape: tuple[int, int]) -> np.ndarray:
+    """Return the corners (4, 2) of an image on the sky, degrees, in order."""
+    ny, nx = shape
+    x = np.array([-0.5, nx - 0.5, nx - 0.5, -0.5])
+    y = np.array([-0.5, -0.5, ny - 0.5, ny - 0.5])
+    return np.stack(WCS(header).all_pix2world(x, y, 0), axis=1)
+
+
+def pixel_areas(header: dict, shape: tuple[int, int], step: int = 256) -> np.ndarray:
+    """Return the area (ny, nx), arcsec2, of every pixel.
+
+    The area varies smoothly (SIP of fourth order): it is computed exactly on a coarse grid and interpolated by cubic
+    splines, to better than 1e-6.
+    """
+    wcs = WCS(header)
+    ys, xs = (np.unique(np.r_[np.arange(0, n - 1, step), n - 1]).astype(float) for n in shape)
+    x, y = np.meshgrid(xs, ys)
+    ra = {}
+    for name, dx, dy in (("e", 0.5, 0), ("w", -0.5, 0), ("n", 0, 0.5), ("s", 0, -0.5)):
+        ra[name] = np.stack(wcs.all_pix2world(x + dx, y + dy, 0))
+    middle = np.radians((ra["e"][1] + ra["w"][1]) / 2)
+
+    def step_of(a: str, b: str) -> tuple[np.ndarray, np.ndarray]:
+        east = ((ra[a][0] - ra[b][0] + 180) % 360 - 180) * np.cos(middle)
+        return east * 3600, (ra[a][1] - ra[b][1]) * 3600
+
+    (xe, xn), (ye, yn) = step_of("e", "w"), step_of("n", "s")
+    area = np.abs(xe * yn - xn * ye)
+    order = [min(3, len(axis) - 1) for axis in (ys, xs)]
+    spline = RectBivariateSpline(ys, xs, area, kx=order[0], ky=order[1])
+    return spline(np.arange(shape[0]), np.arange(shape[1])).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Numerical work on one unit: arrays in, arrays out; no dask, no files."""

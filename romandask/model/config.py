@@ -1,0 +1,200 @@
+"""Settings of the stages that all instruments share, and how YAML and `key=value` text become settings.
+
+Values only: user text reaches YAML's safe loader and pydantic, nothing that evaluates code.
+"""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from romandask.model.errors import UserError
+from romandask.model.sky import Region
+from romandask.model.tiles import TileGrid
+
+
+class Section(BaseModel):
+    """A part of a pipeline file: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RegionSettings(Section):
+    """The patch of sky that the survey covers: a box; ra may cross 0 (then the first value is the larger)."""
+
+    ra: tuple[float, float] = Field(description="right ascension from, to; degrees")
+    dec: tuple[float, float] = Field(description="declination from, to; degrees")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RegionSettings:
+        if not (-90 <= self.dec[0] < self.dec[1] <= 90):
+            raise ValueError("dec must be [from, to] within -90..90 and increasing")
+        if not all(0 <= value <= 360 for value in self.ra) or self.ra[0] == self.ra[1]:
+            raise ValueError("ra must be [from, to], two different values within 0..360")
+        return self
+
+    def region(self) -> Region:
+        """Return the box as a value."""
+        return Region(self.ra[0], self.ra[1], self.dec[0], self.dec[1])
+
+
+class TruthSettings(Section):
+    """Where galaxies and stars come from."""
+
+    source: Literal["generate", "skycatalogs"] = "generate"
+    path: str | None = Field(None, description="folder of the source catalog, below `data`")
+    seds: str | None = Field(None, description="folder of spectra that the catalog names, below `data`")
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
+    margin: float = Field(20.0, ge=0, description="objects this far outside the region are kept, arcsec")
+    galaxies: float = Field(597.2, ge=0, description="galaxies to r < 29, per square arcminute")
+    stars: float = Field(3.96, ge=0, description="stars to r < 29, per square arcminute")
+    dust: Literal["physical", "troxel2023"] = Field(
+        "physical", description="internal dust in the rest frame, or in the observed frame as the paper did"
+    )
+
+    @model_validator(mode="after")
+    def _has_path(self) -> TruthSettings:
+        if self.source != "generate" and not self.path:
+            raise ValueError(f"truth.path is needed with source: {self.source}")
+        return self
+
+
+class RenderSettings(Section):
+    """How light is drawn."""
+
+    n_waves: int = Field(5, ge=2, le=20, description="PSFs across a band between which the PSF is interpolated")
+    truncation: float = Field(
+        0.02, gt=0, description="surface brightness at a stamp's edge, in units of the sky noise of a pixel"
+    )
+    largest: int = Field(1024, ge=64, description="largest stamp, pixels a side (a power of two)")
+
+
+class CoaddSettings(Section):
+    """The tile grid and the resampling; pixels are those of the finest instrument."""
+
+    scale: float = Field(0.0575, gt=0, description="pixel scale that `pixels` and `overlap` count in, arcsec")
+    pixels: int = Field(8825, gt=32, description="side of a padded tile, pixels")
+    overlap: int = Field(500, ge=0, description="padding on every edge, pixels")
+    pixfrac: float = Field(0.7, gt=0, le=1, description="drop size over input pixel")
+
+    @model_validator(mode="after")
+    def _has_inside(self) -> CoaddSettings:
+        if self.pixels <= 2 * self.overlap:
+            raise ValueError(f"pixels ({self.pixels}) leaves no inner area within two overlaps of {self.overlap}")
+        return self
+
+    def grid(self) -> TileGrid:
+        """Return the tile grid of the survey."""
+        return TileGrid((self.pixels - 2 * self.overlap) * self.scale, self.overlap * self.scale)
+
+
+class DetectionSettings(Section):
+    """Source Extractor's settings (Troxel et al. 2023, section 4.5)."""
+
+    threshold: float = Field(2.5, gt=0, description="detection threshold, sigma of a pixel")
+    min_area: int = Field(5, ge=1, description="least number of connected pixels")
+    deblend_levels: int = Field(48, ge=1)
+    deblend_contrast: float = Field(0.05, ge=0)
+    min_snr: float = Field(5.0, ge=0, description="least signal to noise in the detection image")
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the object tables' partitions")
+
+
+class MatchSettings(Section):
+    """Friends of friends over all object tables."""
+
+    linking_lengths: tuple[float, ...] = Field((1.0, 0.5), min_length=1, description="arcsec")
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
+
+
+class RunSettings(Section):
+    """The local cluster."""
+
+    workers: int = Field(2, ge=1)
+    memory_limit: float = Field(2.0, gt=0.5, description="GiB a worker")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping that a YAML file holds; UserError where it holds none."""
+    try:
+        text = path.read_text()
+        content = yaml.safe_load(text)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f" at line {where.line + 1}" if where else ""
+        raise UserError(f"{path}: not valid YAML{line} ({getattr(error, 'problem', 'not text')})") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds {type(content).__name__}, expected a mapping of settings")
+    return content
+
+
+def apply_overrides(content: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
+    """Return the settings with `section.key=value` texts applied; values are read as YAML."""
+    result = _copy(content)
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key.strip():
+            raise UserError(f"{override!r}: an override is written key=value, for example coadds.pixfrac=0.8")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise UserError(f"{override!r}: {text!r} is not a valid value") from None
+        place = result
+        *parents, last = key.strip().split(".")
+        for parent in parents:
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise UserError(f"{override!r}: {parent} holds a value, not a section")
+        place[last] = value
+    return result
+
+
+def validate(model: type[Section], content: dict[str, Any], source: str) -> Any:
+    """Return the settings, or raise one UserError that names every wrong key of `source`."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        lines = [_explain(model, item) for item in error.errors(include_url=False)]
+        raise UserError(f"{source}: " + "; ".join(lines)) from None
+
+
+def _explain(model: type[Section], item: Any) -> str:
+    location = [str(part) for part in item["loc"]]
+    key = ".".join(location)
+    if item["type"] == "extra_forbidden":
+        known = _keys_at(model, location[:-1])
+        close = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
+        hint = f", did you mean {'.'.join([*location[:-1], close[0]])}?" if close else f"; valid: {', '.join(known)}"
+        return f"unknown key {key}{hint}"
+    if item["type"] == "missing":
+        return f"missing key {key}"
+    message = item["msg"].removeprefix("Value error, ")
+    return f"{key}: {message}" + ("" if item["type"] == "value_error" else f" (found {item['input']!r})")
+
+
+def _keys_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    """Return the valid keys of the section at `location`."""
+    for part in location:
+        field = model.model_fields.get(part)
+        nested = _section_of(field.annotation) if field else None
+        if nested is None:
+            return []
+        model = nested
+    return list(model.model_fields)
+
+
+def _section_of(annotation: Any) -> type[BaseModel] | None:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return next((found for arg in typing.get_args(annotation) if (found := _section_of(arg))), None)
+    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+
+
+def _copy(content: Any) -> Any:
+    return {key: _copy(value) for key, value in content.items()} if isinstance(content, dict) else content

@@ -1,0 +1,156 @@
+"""Geometry on the sphere: unit vectors, convex polygons, the survey's region and HEALPix cells that cover it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import cdshealpix.nested as healpix
+import numpy as np
+from astropy.coordinates import Latitude, Longitude
+from scipy.spatial import cKDTree
+
+ARCSEC = np.pi / 180 / 3600
+"""One arcsecond in radians."""
+
+
+def unit_vectors(ra, dec) -> np.ndarray:
+    """Return unit vectors (..., 3) of positions in degrees."""
+    ra, dec = np.radians(ra), np.radians(dec)
+    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+
+
+def radec(vectors) -> tuple[np.ndarray, np.ndarray]:
+    """Return right ascension in [0, 360) and declination, degrees, of vectors (..., 3)."""
+    x, y, z = np.moveaxis(np.asarray(vectors), -1, 0)
+    return np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
+def chord(angle: float) -> float:
+    """Return the chord, on the unit sphere, of an angle in arcsec: 2 sin(theta / 2)."""
+    return 2 * np.sin(angle * ARCSEC / 2)
+
+
+def from_tangent_plane(ra: float, dec: float, xi, eta) -> tuple[np.ndarray, np.ndarray]:
+    """Deproject gnomonic offsets (east, north; degrees) about a centre to right ascension and declination."""
+    xi, eta = np.radians(xi), np.radians(eta)
+    a, d = np.radians(ra), np.radians(dec)
+    centre = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+    east = np.array([-np.sin(a), np.cos(a), 0.0])
+    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+    return radec(centre + np.multiply.outer(xi, east) + np.multiply.outer(eta, north))
+
+
+def touching_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index pairs of convex spherical polygons that overlap.
+
+    Parameters
+    ----------
+    first, second : arrays (n, k, 2) and (m, l, 2) of corners, right ascension and declination in degrees,
+        in order along the boundary, each polygon smaller than a hemisphere.
+
+    Two convex polygons are disjoint if and only if the great circle of some edge of one has the whole other
+    polygon on its outer side: exact at RA 0 and at the poles.
+    """
+    a, b = unit_vectors(first[..., 0], first[..., 1]), unit_vectors(second[..., 0], second[..., 1])
+    if len(a) == 0 or len(b) == 0:
+        return np.empty(0, int), np.empty(0, int)
+    centre_a, radius_a = _caps(a)
+    centre_b, radius_b = _caps(b)
+    near = cKDTree(centre_b).query_ball_point(centre_a, radius_a + radius_b.max())
+    i = np.repeat(np.arange(len(a)), [len(found) for found in near])
+    j = np.array([k for found in near for k in found], dtype=int)
+    keep = np.linalg.norm(centre_a[i] - centre_b[j], axis=1) <= radius_a[i] + radius_b[j]
+    i, j = i[keep], j[keep]
+    keep = ~(_outside(a[i], b[j]) | _outside(b[j], a[i]))
+    i, j = i[keep], j[keep]
+    order = np.lexsort((j, i))
+    return i[order], j[order]
+
+
+def _caps(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    centre = corners.sum(axis=1)
+    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
+    return centre, np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+
+
+def _outside(polygons: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """True where an edge of polygons[n] separates it from others[n]."""
+    normals = np.cross(polygons, np.roll(polygons, -1, axis=1))
+    inward = np.sign(np.einsum("nkc,nc->nk", normals, polygons.sum(axis=1)))
+    return (np.einsum("nkc,nlc->nkl", normals * inward[..., None], others) < 0).all(axis=2).any(axis=1)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box in right ascension and declination; it may cross RA 0 (then ra_min > ra_max)."""
+
+    ra_min: float
+    """degrees"""
+    ra_max: float
+    """degrees"""
+    dec_min: float
+    """degrees"""
+    dec_max: float
+    """degrees"""
+
+    @property
+    def width(self) -> float:
+        """Extent in right ascension, degrees of RA."""
+        return (self.ra_max - self.ra_min) % 360 or 360.0
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Right ascension and declination of the middle, degrees."""
+        return (self.ra_min + self.width / 2) % 360, (self.dec_min + self.dec_max) / 2
+
+    @property
+    def area(self) -> float:
+        """True solid angle, square arcminutes."""
+        heights = np.sin(np.radians(self.dec_max)) - np.sin(np.radians(self.dec_min))
+        return float(np.radians(self.width) * heights * (180 * 60 / np.pi) ** 2)
+
+    def contains(self, ra, dec, margin: float = 0.0) -> np.ndarray:
+        """True where a position lies inside the box grown by `margin` arcsec; the upper edges are outside.
+
+        Without a margin the lower edges are inside and the upper ones outside, so boxes that meet share nothing.
+        """
+        low, high = self.dec_min - margin / 3600, self.dec_max + margin / 3600
+        limit = min(max(abs(low), abs(high)), 89.0)
+        grow = margin / 3600 / np.cos(np.radians(limit))
+        offset = (np.asarray(ra) - self.ra_min + grow) % 360
+        return (offset < min(self.width + 2 * grow, 360.0)) & (np.asarray(dec) >= low) & (np.asarray(dec) < high)
+
+    def cells(self, order: int, margin: float = 0.0) -> np.ndarray:
+        """Return the HEALPix cells (nested, `order`) that may touch the box grown by `margin` arcsec, sorted."""
+        ra, dec = self.centre
+        corners = unit_vectors(
+            np.array([self.ra_min, self.ra_min, self.ra_max, self.ra_max]),
+            np.array([self.dec_min, self.dec_max, self.dec_min, self.dec_max]),
+        )
+        # the furthest point of a box from its centre is a corner or, poleward of it, the middle of an edge
+        corners = np.vstack([corners, unit_vectors([ra, ra], [self.dec_min, self.dec_max])])
+        radius = np.arccos(np.clip(corners @ unit_vectors(ra, dec), -1, 1).min()) + (margin + 1) * ARCSEC
+        cells = cells_in_cone(ra, dec, np.degrees(radius), order)
+        lon, lat = healpix.healpix_to_lonlat(cells, order)
+        reach = 1.2 * np.degrees(np.sqrt(4 * np.pi / (12 * 4**order))) * 3600
+        inside = self.contains(lon.to_value("deg"), lat.to_value("deg"), margin + reach)
+        return np.sort(cells[inside].astype(np.int64))
+
+
+def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> np.ndarray:
+    """Return the HEALPix cells (nested) that may touch a cone; all angles in degrees."""
+    lon, lat = Longitude(ra * u.deg), Latitude(dec * u.deg)
+    cells, _, _ = healpix.cone_search(lon, lat, min(radius, 180.0) * u.deg, order, flat=True)
+    return np.sort(np.asarray(cells, dtype=np.int64))
+
+
+def cell_of(ra, dec, order: int) -> np.ndarray:
+    """Return the HEALPix cell (nested, `order`) of positions in degrees."""
+    lon, lat = Longitude(np.atleast_1d(ra) * u.deg), Latitude(np.atleast_1d(dec) * u.deg)
+    return healpix.lonlat_to_healpix(lon, lat, order).astype(np.int64)
+
+
+def cell_area(order: int) -> float:
+    """Return the area of a HEALPix cell, square arcminutes."""
+    return 4 * np.pi * (180 * 60 / np.pi) ** 2 / (12 * 4**order)

@@ -1,0 +1,60 @@
+"""The manifest: one record a unit, written after its data. A unit is done if and only if its record says so."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from romandask.runtime.store import Store, write_json
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of a unit that has been stored."""
+
+    stage: str
+    unit: str
+    inputs: str
+    """Hash of everything that the unit depends on."""
+    output: str
+    """Hash of what was made, independent of compression."""
+    bytes: int
+    """Uncompressed size."""
+    rows: int
+    """Rows of a table, pixels of an image."""
+    seconds: float
+    peak_bytes: int
+    """Largest resident memory of the worker that made it, so far in its life."""
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_record(store: Store, stage: str, unit: str) -> Record | None:
+    """Return the record of a unit; None where there is none or where it cannot be read."""
+    try:
+        return Record(**json.loads(store.record(stage, unit).read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def write_record(store: Store, record: Record) -> None:
+    """Write a record, atomically."""
+    write_json(store.record(record.stage, record.unit), asdict(record))
+
+
+def digest(*parts: Any) -> str:
+    """Return a hash of values: mappings and sequences by their sorted JSON, arrays and bytes by their content."""
+    state = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        if isinstance(part, bytes):
+            state.update(part)
+        elif isinstance(part, np.ndarray):
+            state.update(f"{part.dtype.str}{part.shape}".encode())
+            state.update(np.ascontiguousarray(part).data)
+        else:
+            state.update(json.dumps(part, sort_keys=True, default=str).encode())
+        state.update(b"\0")
+    return state.hexdigest()

@@ -1,0 +1,237 @@
+"""Products: lazy images and tables over units, which read a unit from the store where it is and make it where it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import dask
+import dask.array as da
+import dask.dataframe as dd
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import xarray as xr
+import zarr
+
+from romandask.model.errors import UserError
+from romandask.runtime.manifest import digest, read_record
+from romandask.runtime.store import Store, Variable, open_images, read_parquet, write_coordinate, write_parquet
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One thing that a stage makes."""
+
+    name: str
+    """Unique within the stage; also its file name."""
+    settings: Any
+    """Everything but upstream units that its content depends on, as values that JSON can hold."""
+    inputs: tuple[tuple[str, str], ...] = ()
+    """(stage, unit) of the upstream units that it reads."""
+    cost: float = 1.0
+    """Relative time, so that long units go first."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What storing one unit wrote."""
+
+    output: str
+    """Hash of the content."""
+    bytes: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class ImageProduct:
+    """Images over units; `dataset` is the lazy xarray view."""
+
+    stage: str
+    """For example exposures/roman; also its place in the store."""
+    units: tuple[Unit, ...]
+    make: Callable[[int], dict[str, np.ndarray]]
+    """Makes the arrays of one unit."""
+    variables: tuple[Variable, ...]
+    axes: tuple[str, ...]
+    """Names of the axes over units."""
+    lengths: tuple[int, ...]
+    """Their lengths; units are in C order."""
+    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
+    attributes: dict[str, Any] = field(default_factory=dict)
+    bytes_per_unit: int = 0
+    """Peak memory, bytes, of making one unit beyond the interpreter."""
+    store: Store | None = None
+
+    def stored(self, store: Store) -> ImageProduct:
+        """Return the same product, reading what the store has."""
+        return replace(self, store=store)
+
+    def load(self, index: int, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+        """Return the arrays of a unit: read where the manifest has it, made where not."""
+        if self.store is not None and read_record(self.store, self.stage, self.units[index].name):
+            group = zarr.open_group(self.store.images(self.stage), mode="r")
+            place = np.unravel_index(index, self.lengths)
+            wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
+            return {name: group[name][place] for name in wanted}  # type: ignore[index]
+        return self.make(index)
+
+    def prepare(self, store: Store) -> None:
+        """Make the arrays and coordinates that units are written into."""
+        if not self.units:
+            return
+        group = open_images(store.images(self.stage), self.variables, self.lengths, self.axes)
+        for name, (axes, values, attributes) in self.coordinates.items():
+            write_coordinate(group, name, values, axes, attributes)
+        group.attrs.update(self.attributes)
+
+    def write(self, index: int, store: Store) -> Made:
+        """Make one unit and write it; no other unit shares its shards."""
+        arrays = self.make(index)
+        group = zarr.open_group(store.images(self.stage), mode="r+")
+        place = np.unravel_index(index, self.lengths)
+        for variable in self.variables:
+            array = arrays[variable.name]
+            if array.shape != variable.shape or not np.isfinite(array).all():
+                raise ValueError(
+                    f"{self.stage} {self.units[index].name}: {variable.name} has shape {array.shape}, expected "
+                    f"{variable.shape}, or values that are not finite"
+                )
+            group[variable.name][place] = array.astype(variable.dtype, copy=False)  # type: ignore[index]
+        ordered = [arrays[variable.name] for variable in self.variables]
+        return Made(digest(*ordered), sum(array.nbytes for array in ordered), ordered[0].size)
+
+    @cached_property
+    def dataset(self) -> xr.Dataset:
+        """The lazy dataset, one chunk a unit; a unit's variables share one reading or making of it."""
+        chunks = tuple((1,) * length for length in self.lengths)
+        name = f"{self.stage.replace('/', '-')}-" + digest([unit.settings for unit in self.units])
+        source = dask.delayed(self, name=f"{name}-product", traverse=False)
+        bundles = da.map_blocks(
+            _load_block, source, self.lengths, chunks=chunks, dtype=object, name=f"{name}-unit", meta=np.empty((0,) * len(chunks), object)
+        )  # fmt: skip
+        data = {}
+        for variable in self.variables:
+            data[variable.name] = (
+                (*self.axes, *variable.axes),
+                da.map_blocks(
+                    _pick,
+                    bundles,
+                    variable.name,
+                    chunks=chunks + tuple((length,) for length in variable.shape),
+                    new_axis=list(range(len(chunks), len(chunks) + len(variable.shape))),
+                    dtype=variable.dtype,
+                    meta=np.empty((0,) * (len(chunks) + len(variable.shape)), variable.dtype),
+                    name=f"{name}-{variable.name}",
+                ),
+                variable.attributes,
+            )
+        coordinates = {
+            key: (axes, values.astype(str) if values.dtype == object else values, attributes)
+            for key, (axes, values, attributes) in self.coordinates.items()
+        }
+        return xr.Dataset(data, coordinates, self.attributes)
+
+
+def _load_block(product: ImageProduct, lengths: tuple[int, ...], block_id: tuple[int, ...] = ()) -> np.ndarray:
+    bundle = np.empty((1,) * len(lengths), object)
+    bundle.flat[0] = product.load(int(np.ravel_multi_index(block_id, lengths)))
+    return bundle
+
+
+def _pick(bundle: np.ndarray, name: str) -> np.ndarray:
+    return bundle.flat[0][name][(None,) * bundle.ndim]
+
+
+@dataclass(frozen=True)
+class TableProduct:
+    """A table over units, HEALPix partitions or others; `frame` is the lazy dask DataFrame."""
+
+    stage: str
+    units: tuple[Unit, ...]
+    make: Callable[[int], pd.DataFrame]
+    schema: pa.Schema
+    pixels: tuple[int, ...] | None = None
+    """HEALPix cell of each unit where the product is a HATS catalog."""
+    order: int | None = None
+    bytes_per_unit: int = 0
+    store: Store | None = None
+
+    def stored(self, store: Store) -> TableProduct:
+        """Return the same product, reading what the store has."""
+        return replace(self, store=store)
+
+    def load(self, index: int) -> pd.DataFrame:
+        """Return the rows of a unit: read where the manifest has it, made where not."""
+        if self.store is not None and (record := read_record(self.store, self.stage, self.units[index].name)):
+            if record.rows == 0:
+                return to_frame(self.schema.empty_table())
+            return to_frame(read_parquet(self._path(index, self.store)))
+        return to_frame(conform(self.make(index), self.schema, self.stage))
+
+    def prepare(self, store: Store) -> None:
+        """Tables need nothing before their units are written."""
+
+    def write(self, index: int, store: Store) -> Made:
+        """Make one unit and write it; a unit without rows has a record and no file."""
+        table = conform(self.make(index), self.schema, self.stage)
+        path = self._path(index, store)
+        if table.num_rows == 0 and self.pixels is not None:
+            path.unlink(missing_ok=True)
+            return Made(digest(b""), 0, 0)
+        return Made(digest(write_parquet(path, table)), table.nbytes, table.num_rows)
+
+    @property
+    def frame(self) -> dd.DataFrame:
+        """The lazy table, a partition a unit."""
+        meta = to_frame(self.schema.empty_table())
+        if not self.units:
+            return dd.from_pandas(meta, npartitions=1)
+        return dd.from_map(_LoadPartition(self), range(len(self.units)), meta=meta, label=self.stage.replace("/", "-"))
+
+    def all_rows(self) -> pd.DataFrame:
+        """Return the whole table in memory."""
+        parts = [self.load(index) for index in range(len(self.units))]
+        filled = [part for part in parts if len(part)] or parts[:1]
+        return pd.concat(filled, ignore_index=True) if filled else to_frame(self.schema.empty_table())
+
+    def _path(self, index: int, store: Store):
+        if self.pixels is None:
+            return store.table(self.stage, self.units[index].name)
+        return store.partition(self.stage, self.order or 0, self.pixels[index])
+
+
+@dataclass(frozen=True)
+class _LoadPartition:
+    product: TableProduct
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        return self.product.load(index)
+
+
+def to_frame(table: pa.Table) -> pd.DataFrame:
+    """Return a table as pandas with Arrow-independent types (lists become arrays)."""
+    return table.replace_schema_metadata(None).to_pandas()
+
+
+def conform(frame: pd.DataFrame, schema: pa.Schema, name: str) -> pa.Table:
+    """Return the frame as a table of exactly the schema's columns and types.
+
+    Raises
+    ------
+    UserError
+        If a column is missing or holds what its type cannot.
+    """
+    arrays = []
+    for column in schema:
+        if column.name not in frame:
+            raise UserError(f"{name}: column {column.name!r} is missing (found {', '.join(map(str, frame.columns))})")
+        try:
+            values = frame[column.name]
+            values = list(values) if pa.types.is_list(column.type) else values.to_numpy()
+            arrays.append(pa.array(values, type=column.type, from_pandas=False))
+        except (pa.ArrowInvalid, pa.ArrowTypeError, ValueError) as error:
+            raise UserError(f"{name}: column {column.name!r} cannot be {column.type}: {error}") from None
+    return pa.Table.from_arrays(arrays, schema=schema)

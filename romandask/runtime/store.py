@@ -1,0 +1,174 @@
+"""The store: the only module that knows path names. Files are written whole, beside their place, then renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
+
+from romandask.model.errors import UserError
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of an image product; its axes are those of the units, then those of a unit."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    """Of one unit."""
+    axes: tuple[str, ...]
+    """Names of the axes of one unit."""
+    attributes: dict[str, Any]
+    """units, long_name, ..."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder that holds one survey."""
+
+    root: Path
+
+    @property
+    def pipeline(self) -> Path:
+        """The resolved configuration."""
+        return self.root / "pipeline.yaml"
+
+    @property
+    def report(self) -> Path:
+        """The folder of the report."""
+        return self.root / "report"
+
+    def catalog(self, name: str) -> Path:
+        """Folder of a HATS catalog, for example truth/galaxies."""
+        return self.root / name
+
+    def partition(self, name: str, order: int, pixel: int) -> Path:
+        """File of one partition of a HATS catalog."""
+        folder = pixel // 10_000 * 10_000
+        return self.root / name / "dataset" / f"Norder={order}" / f"Dir={folder}" / f"Npix={pixel}.parquet"
+
+    def table(self, name: str, unit: str | None = None) -> Path:
+        """File of a table that is not partitioned by the sky, whole or one unit of it."""
+        return self.root / f"{name}.parquet" if unit is None else self.root / name / f"{unit}.parquet"
+
+    def images(self, name: str) -> Path:
+        """Zarr group of an image product."""
+        return self.root / f"{name}.zarr"
+
+    def record(self, stage: str, unit: str) -> Path:
+        """Manifest record of one unit."""
+        return self.root / "manifest" / stage / f"{unit}.json"
+
+    def records(self, stage: str) -> list[Path]:
+        """All manifest records of a stage."""
+        return sorted((self.root / "manifest" / stage).glob("*.json"))
+
+    def prepare(self) -> None:
+        """Make the folder, and raise a UserError where it cannot be written."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            probe = self.root / f".probe-{uuid.uuid4().hex}"
+            probe.write_bytes(b"")
+            probe.unlink()
+        except OSError as error:
+            raise UserError(f"{self.root}: the store cannot be written ({error.strerror}): choose another --store") from None
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that it appears whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file whole."""
+    write_bytes(path, json.dumps(content, indent=1, sort_keys=True, default=str).encode())
+
+
+def write_parquet(path: Path, table: pa.Table) -> bytes:
+    """Write a Parquet file whole, with page checksums, and return the bytes that were written."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    content = sink.getvalue().to_pybytes()
+    write_bytes(path, content)
+    return content
+
+
+def read_parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Read a Parquet file, page checksums verified."""
+    return pq.ParquetFile(path, page_checksum_verification=True).read(columns=columns)
+
+
+def open_images(
+    path: Path, variables: tuple[Variable, ...], lengths: tuple[int, ...], axes: tuple[str, ...]
+) -> zarr.Group:
+    """Open, or make, the Zarr group of an image product with `lengths` units along the axes `axes`.
+
+    One unit is one shard (one writer), cut in inner chunks of about 1k x 1k, each with a checksum. An array made for
+    another number of units is resized.
+    """
+    group = zarr.open_group(path, mode="a")
+    for variable in variables:
+        shape = (*lengths, *variable.shape)
+        if variable.name in group:
+            array = group[variable.name]
+            if not isinstance(array, zarr.Array):
+                raise UserError(f"{path}/{variable.name}: not an array: use another store")
+            if array.shape[len(lengths) :] == variable.shape and array.dtype == np.dtype(variable.dtype):
+                if array.shape != shape:
+                    array.resize(shape)
+                array.update_attributes(variable.attributes)
+                continue
+        ones = (1,) * len(lengths)
+        inner = tuple(_inner_chunk(length) for length in variable.shape)
+        shard = tuple(-(-length // chunk) * chunk for length, chunk in zip(variable.shape, inner, strict=True))
+        group.create_array(
+            variable.name,
+            shape=shape,
+            dtype=variable.dtype,
+            chunks=ones + inner,
+            shards=ones + shard,
+            compressors=[BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle"), Crc32cCodec()],
+            fill_value=0,
+            dimension_names=(*axes, *variable.axes),
+            attributes=variable.attributes,
+            config={"write_empty_chunks": True},
+            overwrite=True,
+        )
+    return group
+
+
+def write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict) -> None:
+    """Write one coordinate array whole; texts as variable-length UTF-8."""
+    text = values.dtype.kind in "OU"
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        dtype="string" if text else values.dtype,
+        chunks=values.shape,
+        compressors=[ZstdCodec(level=1, checksum=True)],
+        dimension_names=axes,
+        attributes=attributes,
+        overwrite=True,
+    )
+    array[...] = values.astype(object) if text else values
+
+
+def _inner_chunk(length: int) -> int:
+    """Return a chunk of about 1024 that divides the length as evenly as it can."""
+    return -(-length // max(1, round(length / 1024)))

@@ -84,8 +84,8 @@ class Instrument(Protocol):
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
         """Return visits that cover a region: the columns of Exposure without the detector."""
 
-    def headers(self, exposure: Exposure) -> dict[int, dict]:
-        """Return the exact FITS header of every detector of a visit."""
+    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
+        """Return the corners (4, 2), degrees, of every detector of a visit (whose own detector is not used)."""
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact FITS header of an exposure."""

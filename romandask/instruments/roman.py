@@ -15,7 +15,7 @@ from coord.util import sun_position_ecliptic
 from galsim.roman.roman_wcs import theta_fpa
 from pydantic import Field
 
-from romandask.instruments.exposure import Exposure, pixel_areas
+from romandask.instruments.exposure import Exposure, footprint, pixel_areas
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import PsfBasis, sample_basis
@@ -108,17 +108,13 @@ class Roman:
             visit=np.arange(len(rows)), seeing=np.nan, airmass=np.nan, sky_brightness=np.nan
         )
 
-    def headers(self, exposure: Exposure, detectors: tuple[int, ...] = SCAS) -> dict[int, dict]:
-        """Return the exact TAN-SIP headers of some SCAs of a visit (pa is that of the focal plane's centre)."""
-        target = galsim.CelestialCoord(exposure.ra * galsim.degrees, exposure.dec * galsim.degrees)
-        all_wcs = galsim.roman.getWCS(
-            target, PA=exposure.pa * galsim.degrees, date=_date(exposure.mjd), SCAs=list(detectors), PA_is_FPA=True
-        )
-        return {sca: _header(all_wcs[sca]) for sca in detectors}
+    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
+        """Return the corners of the 18 SCAs of a visit; ValueError where the Sun is too near or too far."""
+        return {sca: footprint(header, self.shape) for sca, header in _headers(visit, SCAS).items()}
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact TAN-SIP header of an exposure."""
-        return self.headers(exposure, (exposure.detector,))[exposure.detector]
+        return _headers(exposure, (exposure.detector,))[exposure.detector]
 
     def psf(self, exposure: Exposure, size: int) -> PsfBasis:
         """Return the PSF basis of an exposure, for stamps up to `size`: one PSF an SCA and band, as in the paper."""
@@ -181,6 +177,15 @@ def best_roll(ra: float, dec: float, mjd: float) -> float | None:
     east = np.cos(sun.dec.rad) * np.sin(difference)
     north = np.cos(height) * np.sin(sun.dec.rad) - np.sin(height) * np.cos(sun.dec.rad) * np.cos(difference)
     return float((np.degrees(np.arctan2(east, north)) + theta_fpa / galsim.degrees) % 360)
+
+
+def _headers(visit: Exposure, scas: tuple[int, ...]) -> dict[int, dict]:
+    """Return the headers of some SCAs of a visit; its pa is that of the focal plane's centre."""
+    target = galsim.CelestialCoord(visit.ra * galsim.degrees, visit.dec * galsim.degrees)
+    all_wcs = galsim.roman.getWCS(
+        target, PA=visit.pa * galsim.degrees, date=_date(visit.mjd), SCAs=list(scas), PA_is_FPA=True
+    )
+    return {sca: _header(all_wcs[sca]) for sca in scas}
 
 
 def _date(mjd: float):

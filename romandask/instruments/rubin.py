@@ -115,9 +115,14 @@ class Rubin:
         visits = pd.concat(rows).sort_values(["mjd", "band"], ignore_index=True)
         return visits.assign(visit=np.arange(len(visits)))
 
-    def headers(self, exposure: Exposure) -> dict[int, dict]:
-        """Return the headers of the 189 detectors of a visit."""
-        return {detector: _header(exposure, detector, self.shape) for detector in range(189)}
+    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
+        """Return the corners of the 189 detectors of a visit."""
+        half = np.array(self.shape[::-1]) * SCALE / 2
+        x, y = (_CENTRES[:, None, :] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).transpose(2, 0, 1) / 3600
+        angle = np.radians(visit.pa)
+        xi, eta = -x * np.cos(angle) + y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
+        corners = np.stack(from_tangent_plane(visit.ra, visit.dec, xi, eta), axis=-1)
+        return dict(enumerate(corners))
 
     def header(self, exposure: Exposure) -> dict:
         """Return the header of an exposure: gnomonic about the boresight, +y at the position angle `pa`."""

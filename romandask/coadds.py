@@ -1,0 +1,261 @@
+"""Coadds: tiles in nJy with weight, noise realisation, number of exposures and PSF.
+
+Roman's are drizzled from its exposures, one at a time; Rubin's are drawn directly from its cadence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sep
+from astropy.wcs import WCS
+
+from romandask.exposures import RenderExposure, cone, header_text, scene_stamp
+from romandask.instruments.exposure import Exposure, Instrument, exposure_of, pixel_areas
+from romandask.kernels.detector import NO_DATA, SATURATED, noise_realisation
+from romandask.kernels.drizzle import Sums, cut, pixel_map
+from romandask.kernels.psf import PsfBasis
+from romandask.kernels.render import POINT, Scene, draw
+from romandask.kernels.scene import build_scene
+from romandask.kernels.stack import stack
+from romandask.model.config import CoaddSettings, RenderSettings
+from romandask.model.seeds import rng
+from romandask.model.sky import touching_pairs
+from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, ab_photon_density
+from romandask.model.tiles import Tile, tangent_header
+from romandask.pointings import corners_of
+from romandask.runtime.products import ImageProduct, Unit
+from romandask.runtime.store import Variable
+
+PSF_RADIUS = 3.0
+"""Half the side of the PSF images, arcsec, for a pixel of 0.0575 arcsec; larger pixels get larger images."""
+BACKGROUND_MESH = 256
+"""Pixels of the mesh on which an exposure's background is estimated."""
+
+
+def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) -> ImageProduct:
+    """Return the lazy coadds of a survey's exposures: dims (tile, band, y, x).
+
+    A tile reads its exposures one at a time from the exposures product: from the store where they are, rendered where
+    not. The tiles of an instrument that is drawn from its cadence use the exposures' table and truth, and render none.
+    """
+    render = exposures.make
+    if not isinstance(render, RenderExposure):
+        raise TypeError("coadds need the product that exposures() returns")
+    instrument, table = render.instrument, render.table
+    grid = settings.grid()
+    pixels = grid.pixels(instrument.coadd_scale)
+    drawn = instrument.coadd_from == "pointings"
+    footprints = np.stack([tile.corners(grid.side) for tile in tiles])
+    e, t = touching_pairs(corners_of(table), footprints)
+    bands = table["band"].to_numpy()
+    members = {
+        (k, band): e[(t == k) & (bands[e] == band)] for k in range(len(tiles)) for band in instrument.bands
+    }
+    maker = (DrawTile if drawn else DrizzleTile)(exposures, tuple(tiles), members, settings, pixels, render.render)
+    units = []
+    for k, tile in enumerate(tiles):
+        for band in instrument.bands:
+            state: dict[str, Any] = {
+                **settings.model_dump(), "tile": tile.name, "band": band, "instrument": instrument.name,
+                "exposures": [exposures.units[i].name for i in members[k, band]],
+            }  # fmt: skip
+            if drawn:
+                state |= {"rows": [vars(exposure_of(table.iloc[i])) for i in members[k, band]], **render.render.model_dump()}
+                ra, dec, radius = cone(footprints[k])
+                inputs = render.truth.inputs(ra, dec, radius)
+            else:
+                inputs = tuple((exposures.stage, exposures.units[i].name) for i in members[k, band])
+            units.append(Unit(f"{tile.name}-{band}", {**state, "seed": render.seed}, inputs, 1.0 + len(members[k, band])))
+    headers = [header_text(tile.header(pixels, instrument.coadd_scale)) for tile in tiles]
+    coordinates = {
+        "tile": (("tile",), np.array([tile.name for tile in tiles], object), {}),
+        "band": (("band",), np.array(instrument.bands, object), {}),
+        "tile_id": (("tile",), np.array([tile.id for tile in tiles]), {}),
+        "ra": (("tile",), np.array([tile.ra for tile in tiles]), {"units": "deg"}),
+        "dec": (("tile",), np.array([tile.dec for tile in tiles]), {"units": "deg"}),
+        "header": (("tile",), np.array(headers, object), {"description": "FITS header of the WCS, 80-column cards"}),
+    }
+    return ImageProduct(
+        f"coadds/{instrument.name}",
+        tuple(units),
+        maker,
+        _planes(pixels, psf_side(instrument), "1/nJy2" if drawn else "s"),
+        ("tile", "band"),
+        (len(tiles), len(instrument.bands)),
+        coordinates,
+        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+        bytes_per_unit=pixels**2 * (40 if drawn else 26) + int(np.prod(instrument.shape)) * (0 if drawn else 20) + (300 << 20),
+    )
+
+
+def psf_side(instrument: Instrument) -> int:
+    """Return the side of the PSF images of an instrument's coadds, pixels, odd."""
+    radius = PSF_RADIUS * max(1.0, instrument.coadd_scale / 0.1)
+    return 2 * int(round(radius / instrument.coadd_scale)) + 1
+
+
+@dataclass(frozen=True)
+class DrizzleTile:
+    """Makes one tile and band by drizzling its exposures."""
+
+    exposures: ImageProduct
+    tiles: tuple[Tile, ...]
+    members: dict[tuple[int, str], np.ndarray]
+    settings: CoaddSettings
+    pixels: int
+    render: RenderSettings
+
+    def __call__(self, index: int) -> dict[str, np.ndarray]:
+        """Return image, weight, noise, nimages and psf."""
+        source: RenderExposure = self.exposures.make  # type: ignore[assignment]
+        instrument = source.instrument
+        k, b = divmod(index, len(instrument.bands))
+        tile, band = self.tiles[k], instrument.bands[b]
+        scale = instrument.coadd_scale
+        target = WCS(tile.header(self.pixels, scale))
+        to_njy = NJY_ZERO_POINT / instrument.bandpass(band).ab_photons()
+        side = psf_side(instrument)
+        sums = Sums((self.pixels, self.pixels), 2, self.settings.pixfrac)
+        psf = Sums((side, side), 1, self.settings.pixfrac)
+        for i in self.members[k, band]:
+            exposure = exposure_of(source.table.iloc[i])
+            header = instrument.header(exposure)
+            wcs = WCS(header)
+            part = cut(wcs, instrument.shape, target, (self.pixels, self.pixels))
+            if part is None:
+                continue
+            here = (part.rows, part.columns)
+            arrays = self.exposures.load(int(i), ("image", "dq"))
+            good = arrays["dq"] & (SATURATED | NO_DATA) == 0
+            light = subtract_background(arrays["image"], ~good)[here]
+            per_area = (to_njy / exposure.exptime) / pixel_areas(header, instrument.shape)[here]
+            random = rng(source.seed, "coadds", "noise", instrument.name, exposure.visit, exposure.detector)
+            noise = noise_realisation(instrument.background(exposure, header), instrument.detector, random)[here]
+            weight = np.float32(exposure.exptime) * good[here]
+            sums.add([light * per_area, noise * per_area], weight, part.pixmap)
+            _add_star(psf, instrument, exposure, wcs, tile, side)
+        area = np.float32(scale**2)
+        return {
+            "image": sums.image(0) * area,
+            "weight": sums.weight,
+            "noise": sums.image(1) * area,
+            "nimages": sums.count,
+            "psf": psf.image(0) * area,
+        }
+
+
+@dataclass(frozen=True)
+class DrawTile:
+    """Makes one tile and band directly from the cadence: the expectation with the effective PSF, and the stack's noise."""
+
+    exposures: ImageProduct
+    tiles: tuple[Tile, ...]
+    members: dict[tuple[int, str], np.ndarray]
+    settings: CoaddSettings
+    pixels: int
+    render: RenderSettings
+
+    def __call__(self, index: int) -> dict[str, np.ndarray]:
+        """Return image, weight, noise, nimages and psf."""
+        source: RenderExposure = self.exposures.make  # type: ignore[assignment]
+        instrument: Any = source.instrument
+        k, b = divmod(index, len(instrument.bands))
+        tile, band = self.tiles[k], instrument.bands[b]
+        shape = (self.pixels, self.pixels)
+        wcs = WCS(tile.header(self.pixels, instrument.coadd_scale))
+        bandpass = instrument.bandpass(band)
+        chosen = [exposure_of(source.table.iloc[i]) for i in self.members[k, band]]
+        to_njy = NJY_ZERO_POINT / bandpass.ab_photons()
+        gains = np.array([exposure.exptime for exposure in chosen]) / to_njy
+        variances = (np.array([instrument.pixel_noise(exposure) for exposure in chosen]) / gains) ** 2
+        corners = corners_of(source.table.iloc[self.members[k, band]])
+        polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
+        layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
+        if not layers.shares.any():
+            side = psf_side(instrument)
+            blank = np.zeros(shape, np.float32)
+            return {"image": blank, "weight": blank, "noise": blank, "nimages": layers.count, "psf": np.zeros((side, side))}
+        ra, dec, radius = cone(tile.corners(self.settings.grid().side))
+        scene = build_scene(source.truth.near(ra, dec, radius), wcs, bandpass, to_njy, instrument.knot_smoothing)
+        faintest = self.render.truncation / np.sqrt(layers.weight.max())
+        size = max(64, scene_stamp(scene, faintest, self.render.largest))
+        basis = instrument.effective_psf(chosen, layers.shares, size)
+        covered = layers.weight > 0
+        expected = np.where(covered, draw(scene, basis, shape, faintest), 0)
+        empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
+        light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        return {
+            "image": expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0)),
+            "weight": layers.weight,
+            "noise": other * np.sqrt(empty),
+            "nimages": layers.count,
+            "psf": _star(basis, bandpass, psf_side(instrument)),
+        }
+
+
+def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return an exposure (float32, electrons) less its background, estimated from the image itself on a coarse mesh."""
+    light = image.astype(np.float32)
+    background = sep.Background(light, mask=mask, bw=BACKGROUND_MESH, bh=BACKGROUND_MESH)
+    background.subfrom(light)
+    return light
+
+
+def _star(basis: PsfBasis, bandpass: Bandpass, side: int, offset: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """Return a unit star (side, side) of flat f_nu whose centre is `offset` pixels from the middle."""
+    photons = (ab_photon_density(bandpass.wave) * bandpass.throughput) @ bandpass.node_weights()
+    middle = (side - 1) / 2
+    scene = Scene(
+        x=np.array([middle + offset[0]]),
+        y=np.array([middle + offset[1]]),
+        key=np.zeros(1, np.uint64),
+        owner=np.zeros(1, int),
+        kind=np.full(1, POINT),
+        matrix=np.zeros((1, 2, 2)),
+        smoothing=np.zeros((1, 2, 2)),
+        knots=np.zeros(1, int),
+        photons=(photons / photons.sum())[None],
+    )
+    # a star is drawn on the largest stamp that the basis offers
+    return draw(scene, basis, (side, side), 0.0)
+
+
+def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, tile: Tile, side: int) -> None:
+    """Drizzle a unit star, drawn as the exposure sees it as near as possible to the tile's centre, onto the PSF image."""
+    ny, nx = instrument.shape
+    at = np.array(wcs.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float)
+    half = int(np.ceil(side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 4
+    x, y = np.clip(at, half + 1, [nx - half - 2, ny - half - 2])
+    column, row = int(round(x)), int(round(y))
+    star = _star(instrument.psf(exposure, 256), instrument.bandpass(exposure.band), 2 * half + 1, (x - column, y - row))
+    ra, dec = wcs.all_pix2world(x, y, 0)
+    target = WCS(tangent_header(float(ra), float(dec), side, instrument.coadd_scale))
+    rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
+    area = pixel_areas_at(wcs, x, y)
+    weight = np.full(star.shape, exposure.exptime, np.float32)
+    psf.add([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))
+
+
+def pixel_areas_at(wcs: WCS, x: float, y: float) -> float:
+    """Return the area, arcsec2, of the pixel at a position."""
+    ra, dec = wcs.all_pix2world([x + 0.5, x - 0.5, x, x], [y, y, y + 0.5, y - 0.5], 0)
+    east = ((ra[[0, 2]] - ra[[1, 3]] + 180) % 360 - 180) * np.cos(np.radians(dec.mean()))
+    north = dec[[0, 2]] - dec[[1, 3]]
+    return float(abs(east[0] * north[1] - east[1] * north[0]) * 3600**2)
+
+
+def _planes(pixels: int, psf: int, weight_unit: str) -> tuple[Variable, ...]:
+    shape, axes = (pixels, pixels), ("y", "x")
+    return (
+        Variable("image", "float32", shape, axes, {"units": "nJy", "long_name": "flux of a pixel"}),
+        Variable("weight", "float32", shape, axes, {"units": weight_unit, "long_name": "sum of weights"}),
+        Variable("noise", "float32", shape, axes, {"units": "nJy", "long_name": "noise realisation with the image's correlations"}),
+        Variable("nimages", "uint8", shape, axes, {"long_name": "number of exposures"}),
+        Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star at the tile's centre, flat f_nu"}),
+    )
+
+

@@ -228,7 +228,8 @@ def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, t
     """Drizzle a unit star, drawn as the exposure sees it as near as possible to the tile's centre, onto the PSF image."""
     ny, nx = instrument.shape
     at = np.array(wcs.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float)
-    half = int(np.ceil(side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 4
+    # a stamp at any roll covers the corners of the PSF image
+    half = int(np.ceil(1.5 * side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 2
     x, y = np.clip(at, half + 1, [nx - half - 2, ny - half - 2])
     column, row = int(round(x)), int(round(y))
     star = _star(instrument.psf(exposure, 256), instrument.bandpass(exposure.band), 2 * half + 1, (x - column, y - row))

@@ -37,6 +37,8 @@ class TruthCatalogs:
     edges: tuple[float, ...]
     """Edges of top-hat bins, nm; empty where no galaxy has a top-hat spectrum."""
     internal_frame: str
+    source_rows: int = 0
+    """Rows of the source files that the region touches."""
 
     def near(self, ra: float, dec: float, radius: float) -> Truth:
         """Return the rows of the partitions that touch a cone (degrees), with their spectra."""
@@ -87,6 +89,7 @@ def truth(
         source_state: Any = "generate"
         edges: tuple[float, ...] = ()
         files: list[str] = []
+        rows = 0
     else:
         source = skycatalogs.open_source(data / str(settings.path))
         parents = sorted(set((region.cells(skycatalogs.ORDER, settings.margin)).tolist()))
@@ -104,6 +107,7 @@ def truth(
         }  # fmt: skip
         source_state = {"files": source.files(), "seds": list(library.names)}
         edges = source.edges
+        rows = skycatalogs.count_rows(source, parents)
         files = [f"{kind}_{cell}" for cell in parents for kind in ("galaxy", "pointsource") if cell in _kind(source, kind)]
     bands = tuple(bandpasses)
     state = {"settings": settings.model_dump(), "seed": seed, "source": source_state, "bands": bands, "region": vars(region)}
@@ -121,7 +125,7 @@ def truth(
         makers["quarantine"],
         schema("quarantine"),
     )
-    return TruthCatalogs(table("galaxies"), table("stars"), quarantine, library, edges, frame)
+    return TruthCatalogs(table("galaxies"), table("stars"), quarantine, library, edges, frame, rows)
 
 
 def bind(

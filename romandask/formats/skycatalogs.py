@@ -120,6 +120,12 @@ def sed_names(source: Source, cells: list[int]) -> list[str]:
     return sorted(name for name in names if name)
 
 
+def count_rows(source: Source, cells: list[int]) -> int:
+    """Return the rows of the files of some cells, from their footers."""
+    paths = [files[cell] for files in (source.galaxies, source.stars) for cell in cells if cell in files]
+    return sum(pq.read_metadata(path).num_rows for path in paths)
+
+
 def _positions_good(frame: pd.DataFrame) -> pd.Series:
     return np.isfinite(frame["ra"]) & np.isfinite(frame["dec"]) & (frame["dec"].abs() <= 90)
 

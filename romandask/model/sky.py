@@ -124,13 +124,14 @@ class Region:
     def cells(self, order: int, margin: float = 0.0) -> np.ndarray:
         """Return the HEALPix cells (nested, `order`) that may touch the box grown by `margin` arcsec, sorted."""
         ra, dec = self.centre
-        corners = unit_vectors(
-            np.array([self.ra_min, self.ra_min, self.ra_max, self.ra_max]),
-            np.array([self.dec_min, self.dec_max, self.dec_min, self.dec_max]),
-        )
-        # the furthest point of a box from its centre is a corner or, poleward of it, the middle of an edge
-        corners = np.vstack([corners, unit_vectors([ra, ra], [self.dec_min, self.dec_max])])
-        radius = np.arccos(np.clip(corners @ unit_vectors(ra, dec), -1, 1).min()) + (margin + 1) * ARCSEC
+        # the furthest point from the centre lies on the edge; points along it are at most 1/64 of it apart
+        along = np.linspace(0, 1, 65)
+        edge_ra = self.ra_min + self.width * np.concatenate([along, along, along * 0, along * 0 + 1])
+        height = self.dec_min + (self.dec_max - self.dec_min) * along
+        edge_dec = np.concatenate([along * 0 + self.dec_min, along * 0 + self.dec_max, height, height])
+        furthest = (unit_vectors(edge_ra, edge_dec) @ unit_vectors(ra, dec)).min()
+        radius = np.arccos(np.clip(furthest, -1, 1)) + (margin + 1) * ARCSEC
+        radius += np.radians(max(self.width, self.dec_max - self.dec_min)) / 128
         cells = cells_in_cone(ra, dec, np.degrees(radius), order)
         lon, lat = healpix.healpix_to_lonlat(cells, order)
         reach = 1.2 * np.degrees(np.sqrt(4 * np.pi / (12 * 4**order))) * 3600

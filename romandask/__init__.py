@@ -1,0 +1,32 @@
+"""romandask: a joint synthetic sky survey of the Roman Space Telescope and Rubin's LSST, as lazy dask graphs."""
+
+from importlib.metadata import version as _version
+
+from romandask.coadds import coadds
+from romandask.detections import detections, objects
+from romandask.exposures import exposures
+from romandask.matches import matches
+from romandask.model.errors import UserError
+from romandask.pipeline import Pipeline, load_pipeline
+from romandask.pointings import pointings
+from romandask.statistics import statistics
+from romandask.survey import Survey
+from romandask.survey import open_survey as open  # noqa: A004
+from romandask.truth import truth
+
+__version__ = _version("romandask")
+__all__ = [
+    "Pipeline",
+    "Survey",
+    "UserError",
+    "coadds",
+    "detections",
+    "exposures",
+    "load_pipeline",
+    "matches",
+    "objects",
+    "open",
+    "pointings",
+    "statistics",
+    "truth",
+]

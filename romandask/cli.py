@@ -1,0 +1,154 @@
+"""The command line: no logic of its own. A user's mistake is one line and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+# one thread a process: the workers are the parallelism
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import click  # noqa: E402
+import typer  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+from romandask import flow  # noqa: E402
+from romandask.model.errors import UserError  # noqa: E402
+from romandask.pipeline import load_pipeline, pipeline_of  # noqa: E402
+from romandask.report import dag_svg, write_report  # noqa: E402
+from romandask.runtime.cluster import runner  # noqa: E402
+from romandask.runtime.progress import Reporter  # noqa: E402
+from romandask.runtime.store import Store  # noqa: E402
+from romandask.survey import Survey, open_survey  # noqa: E402
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="A joint Roman and Rubin synthetic sky survey.")
+ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
+app.add_typer(ingest_app, name="ingest")
+
+Source = Annotated[str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")]
+Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")]
+Place = Annotated[Path, typer.Option("--store", help="Folder of the store.")]
+Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
+Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Folder of the store.")]
+
+
+@app.command()
+def plan(
+    pipeline: Source,
+    overrides: Overrides = None,
+    dag: Annotated[Path | None, typer.Option("--dag", help="Write the stages as an SVG picture to this file.")] = None,
+) -> None:
+    """Show units, bytes and peak memory of every stage; write nothing."""
+    settings = load_pipeline(pipeline, overrides)
+    rows = flow.plan(Survey(settings))
+    table = Table("stage", "units", "image bytes", "peak memory a worker")
+    for row in rows:
+        size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
+        table.add_row(row.stage, str(row.units), size, f"{row.memory / 2**30:.2f} GiB")
+    total = sum(row.units for row in rows)
+    table.add_row("total", str(total), f"{sum(row.bytes for row in rows) / 1e9:.2f} GB", f"limit {settings.run.memory_limit:.2f} GiB")
+    Console().print(table)
+    if dag is not None:
+        dag_svg(rows, dag)
+        Console().print(f"wrote {dag}", highlight=False)
+
+
+@app.command()
+def run(pipeline: Source, store: Place, overrides: Overrides = None, workers: Workers = None, scheduler: Scheduler = None) -> None:
+    """Make and store everything that is missing, then the report. The same command resumes."""
+    settings = load_pipeline(pipeline, overrides)
+    reporter = Reporter(Console())
+    flow.plan(Survey(settings))
+    place = Store(store)
+    place.prepare()
+    start = time.monotonic()
+    count = settings.run.workers if workers is None else workers
+    with runner(count, settings.run.memory_limit, scheduler) as execution:
+        reporter.say(f"{settings.name}: {execution.description}")
+        summary = flow.run(settings, place, execution, reporter)
+    made, kept = sum(summary.made.values()), sum(summary.kept.values())
+    if made == 0 and not summary.failed:
+        reporter.say(f"nothing to do: all {kept} units of {store} are done")
+    else:
+        reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - start:.0f} s")
+    for name in summary.failed:
+        reporter.say(f"failed: {name}")
+    if summary.failed:
+        reporter.say(f"the reasons are in {store}/manifest/<stage>/<unit>.failed; the same command tries again")
+        raise typer.Exit(1)
+    page = place.report / "index.html"
+    if {"roman", "rubin"} <= set(settings.instruments()) and (made or not page.exists()):
+        reporter.say(f"report: {write_report(open_survey(store))}")
+
+
+@app.command()
+def status(store: StoreArgument) -> None:
+    """Show units done, missing and failed, a line a stage."""
+    table = Table("stage", "units", "done", "missing", "failed")
+    for name, units, done, failed in flow.status(open_survey(store)):
+        known = units >= 0
+        table.add_row(name, str(units) if known else "?", str(done), str(units - done) if known else "?", str(failed))
+    Console().print(table)
+
+
+@app.command()
+def report(store: StoreArgument) -> None:
+    """Write the report, one page without external assets, and say where it is."""
+    Console().print(f"report: {write_report(open_survey(store))}", highlight=False, soft_wrap=True)
+
+
+@ingest_app.command()
+def skycatalogs(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of skyCatalogs files.")],
+    store: Place,
+    seds: Annotated[Path | None, typer.Option("--seds", help="Folder of the spectra that stars name; default: SRC/../seds.")] = None,
+    order: Annotated[int, typer.Option("--order", min=5, max=12, help="HEALPix order of the partitions.")] = 5,
+    workers: Workers = 0,
+) -> None:
+    """Partition skyCatalogs galaxies and stars into HATS catalogs, with fluxes in all ten bands; bad rows to quarantine."""
+    content = {
+        "name": "ingest",
+        "seed": 0,
+        "region": {"ra": [0, 360], "dec": [-90, 90]},
+        "truth": {
+            "source": "skycatalogs", "path": str(source.resolve()), "order": order,
+            "seds": str((seds or source.parent / "seds").resolve()),
+        },
+        "roman": {},
+        "rubin": {},
+    }  # fmt: skip
+    settings = pipeline_of(content, str(source))
+    place = Store(store)
+    survey = Survey(settings)
+    survey.truth_catalogs  # noqa: B018  opened, so that a wrong source is known before anything is written
+    place.prepare()
+    reporter = Reporter(Console())
+    with runner(workers or 0, settings.run.memory_limit) as execution:
+        counts = flow.ingest(settings, place, execution, reporter)
+    reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        code = app(standalone_mode=False)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = 2
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        print("stopped; the same command resumes", file=sys.stderr)
+        code = 130
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

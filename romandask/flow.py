@@ -1,0 +1,265 @@
+"""The stages in order: what each needs a unit, the plan, the run and the status of a store."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+import numpy as np
+
+from romandask.model.errors import UserError
+from romandask.pipeline import Pipeline
+from romandask.runtime.cluster import Runner
+from romandask.runtime.hats import write_catalog_files
+from romandask.runtime.lock import locked
+from romandask.runtime.manifest import digest, read_record
+from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.progress import Reporter
+from romandask.runtime.store import Store, write_bytes, write_json
+from romandask.runtime.work import Task
+from romandask.survey import Survey
+
+Product = ImageProduct | TableProduct
+INTERPRETER = 420 << 20
+"""Resident memory of a worker before it makes anything, bytes."""
+PACKAGES = ("romandask", "astropy", "dask", "distributed", "drizzle", "galsim", "numba", "numpy", "pyarrow", "scipy", "sep", "xarray", "zarr")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: the product that it stores."""
+
+    name: str
+    product: Callable[[Survey], Product]
+    position: tuple[str, str] | None = None
+    """Columns of right ascension and declination where the product is a HATS catalog."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A row of the plan."""
+
+    stage: str
+    units: int
+    bytes: int
+    """Uncompressed size of the images; 0 where it depends on what is found."""
+    memory: int
+    """Peak of a worker, bytes."""
+
+
+@dataclass
+class Summary:
+    """What a run did."""
+
+    made: dict[str, int] = field(default_factory=dict)
+    kept: dict[str, int] = field(default_factory=dict)
+    failed: list[str] = field(default_factory=list)
+    """stage/unit of units that were set aside, and of those that wait for them."""
+
+
+def stages(survey: Survey) -> list[Stage]:
+    """Return the stages of a survey in the order in which they run."""
+    names = list(survey.instruments)
+    found = [
+        Stage("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec")),
+        Stage("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec")),
+        Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine),
+    ]
+    found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
+    found += [
+        Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
+        for name, instrument in survey.instruments.items()
+        if instrument.coadd_from == "exposures"
+    ]
+    for kind, position in (("coadd", None), ("detection", None), ("object", ("coord_ra", "coord_dec"))):
+        found += [
+            Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name), position)
+            for name in names
+        ]
+    if {"roman", "rubin"} <= set(names):
+        found += [
+            Stage(f"matches/{part}", lambda s, part=part: getattr(s.match_products, part))
+            for part in ("local", "crossing", "merged")
+        ]
+        found.append(Stage("matches/groups", lambda s: s.match_products.groups, ("coord_ra", "coord_dec")))
+        found += [
+            Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
+            for part in ("blends", "unrecognised")
+        ]
+    return found
+
+
+def plan(survey: Survey, memory_limit: float | None = None) -> list[Planned]:
+    """Return units, bytes and peak memory of every stage, making nothing but the pointings.
+
+    Raises
+    ------
+    UserError
+        Where a unit does not fit the memory of a worker, or an input is not what it should be.
+    """
+    limit = survey.pipeline.run.memory_limit if memory_limit is None else memory_limit
+    rows = []
+    for stage in stages(survey):
+        product = stage.product(survey)
+        memory = product.bytes_per_unit + INTERPRETER
+        if memory > limit * 2**30 and product.units:
+            setting = "coadds.pixels" if stage.name.split("/")[0] in ("coadds", "detections") else "the truth's order"
+            raise UserError(
+                f"{stage.name} {product.units[0].name} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
+                f"lower {setting} or raise run.memory_limit"
+            )
+        size = 0
+        if isinstance(product, ImageProduct):
+            one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in product.variables)
+            size = one * len(product.units)
+        rows.append(Planned(stage.name, len(product.units), size, memory))
+    return rows
+
+
+def run(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) -> Summary:
+    """Make and store, in order, what is missing or no longer what the pipeline asks for."""
+    summary = Summary()
+    with locked(store.root):
+        write_bytes(store.pipeline, pipeline.to_yaml().encode())
+        write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
+        survey = Survey(pipeline, store)
+        for stage in stages(survey):
+            _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
+    return summary
+
+
+def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) -> dict[str, int]:
+    """Make and store the truth catalogs alone; return rows `in` the source, `out` and `quarantined`.
+
+    Raises
+    ------
+    RuntimeError
+        If the numbers do not add up.
+    """
+    summary = Summary()
+    with locked(store.root):
+        write_bytes(store.pipeline, pipeline.to_yaml().encode())
+        write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
+        survey = Survey(pipeline, store)
+        for stage in stages(survey):
+            if stage.name.startswith("truth/"):
+                _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
+    rows = {row["stage"]: row["rows"] for row in run_figures(store)}
+    out = rows.get("truth/galaxies", 0) + rows.get("truth/stars", 0)
+    counts = {"in": survey.truth_catalogs.source_rows, "out": out, "quarantined": rows.get("truth/quarantine", 0)}
+    if summary.failed or counts["in"] != counts["out"] + counts["quarantined"]:
+        raise RuntimeError(f"rows are missing: {counts}; failed units: {summary.failed}")
+    return counts
+
+
+def _run_stage(
+    stage: Stage, product: Product, store: Store, runner: Runner, reporter: Reporter, summary: Summary
+) -> None:
+    tasks, kept, blocked = _tasks(product, store)
+    summary.kept[stage.name] = kept
+    summary.failed += [f"{stage.name}/{name} (an input is missing)" for name in blocked]
+    _drop_strays(product, store)
+    made = 0
+    if tasks:
+        product.prepare(store)
+        # a unit that is made again reads its upstream from the store, never its own former self
+        with reporter.stage(stage.name, len(tasks)) as meter:
+            for outcome in runner.run(product, tasks, store):
+                meter.advance()
+                if outcome.record is not None:
+                    made += 1
+                    continue
+                name = product.units[outcome.index].name
+                summary.failed.append(f"{stage.name}/{name}")
+                write_bytes(_failure_path(store, product, name), str(outcome.failure).encode())
+    summary.made[stage.name] = made
+    if stage.position is not None and (made or not (store.catalog(product.stage) / "hats.properties").exists()):
+        write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
+
+
+def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
+    """Return the units to make, how many are done, and those that wait for an input that failed."""
+    outputs: dict[tuple[str, str], str | None] = {}
+
+    def output(source: tuple[str, str]) -> str | None:
+        if source not in outputs:
+            record = read_record(store, *source)
+            outputs[source] = record.output if record else None
+        return outputs[source]
+
+    tasks, blocked, kept = [], [], 0
+    for index, unit in enumerate(product.units):
+        upstream = [output(source) for source in unit.inputs]
+        if None in upstream:
+            blocked.append(unit.name)
+            store.record(product.stage, unit.name).unlink(missing_ok=True)
+            continue
+        inputs = digest(product.stage, unit.settings, version("romandask"), upstream)
+        record = read_record(store, product.stage, unit.name)
+        if record is not None and record.inputs == inputs:
+            kept += 1
+            continue
+        store.record(product.stage, unit.name).unlink(missing_ok=True)
+        tasks.append(Task(index, inputs, unit.cost))
+    return tasks, kept, blocked
+
+
+def _drop_strays(product: Product, store: Store) -> None:
+    """Remove the records of units that the stage no longer has, and of failures that are tried again."""
+    names = {unit.name for unit in product.units}
+    for path in store.records(product.stage):
+        if path.stem not in names:
+            path.unlink()
+    for path in store.record(product.stage, "x").parent.glob("*.failed"):
+        path.unlink()
+
+
+def _failure_path(store: Store, product: Product, name: str):
+    return store.record(product.stage, name).with_suffix(".failed")
+
+
+def status(survey: Survey) -> list[tuple[str, int, int, int]]:
+    """Return (stage, units, done, failed) of every stage of a store; units is -1 where it is not known yet."""
+    store = survey.store
+    assert store is not None
+    rows = []
+    for stage in stages(survey):
+        folder = store.record(stage.name, "x").parent
+        failed = len(list(folder.glob("*.failed")))
+        done = len(store.records(stage.name))
+        known = not stage.name.startswith(("exposures", "coadds", "detections", "objects", "matches", "statistics"))
+        if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
+            units = len(stage.product(survey).units)
+        else:
+            units = -1
+        rows.append((stage.name, units, done, failed))
+    return rows
+
+
+def run_figures(store: Store) -> list[dict]:
+    """Return, a stage, units, seconds of work, bytes, rows and the largest memory of a worker, from the manifest."""
+    rows = []
+    for folder in sorted((store.root / "manifest").glob("*/*")):
+        stage = f"{folder.parent.name}/{folder.name}"
+        records = [record for path in store.records(stage) if (record := read_record(store, stage, path.stem))]
+        if records:
+            rows.append(
+                {
+                    "stage": stage,
+                    "units": len(records),
+                    "seconds": sum(record.seconds for record in records),
+                    "bytes": sum(record.bytes for record in records),
+                    "rows": sum(record.rows for record in records),
+                    "peak_bytes": max(record.peak_bytes for record in records),
+                    "warnings": sum(len(record.warnings) for record in records),
+                }
+            )
+    return rows
+
+
+def stored_versions(store: Store) -> dict[str, str]:
+    """Return the package versions that the store was made with."""
+    return json.loads((store.root / "versions.json").read_text())
+

@@ -1,0 +1,159 @@
+"""Pictures of the report, as PNG bytes."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pandas as pd
+from astropy.visualization import make_lupton_rgb
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+ROMAN_RGB = ("F184", "H158", "J129", "Y106")
+RUBIN_RGB = ("z", "i", "r", "g")
+LARGEST = 1600
+"""Pixels a side of a picture of a tile; larger tiles are shown by their middle."""
+
+
+def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: dict[str, pd.DataFrame]) -> bytes:
+    """Return the same sky in colour as each survey sees it, side by side.
+
+    Parameters
+    ----------
+    tiles : by survey, the images by band and the pixel scale (arcsec)
+    objects : by survey, the detected objects of the tile, circled
+    """
+    figure = _figure(7.2 * len(tiles), 7.4)
+    extent = min(min(next(iter(bands.values())).shape) * scale for bands, scale in tiles.values())
+    # very large tiles are shown by their middle, the same sky for every survey
+    extent = min(extent, LARGEST * min(scale for _, scale in tiles.values()))
+    for position, (survey, (bands, scale)) in enumerate(tiles.items()):
+        axes = figure.add_subplot(1, len(tiles), position + 1)
+        names = [name for name in (*ROMAN_RGB, *RUBIN_RGB) if name in bands]
+        chosen = [names[0], names[len(names) // 2], names[-1]]
+        side = next(iter(bands.values())).shape[0]
+        count = int(extent / scale)
+        first = (side - count) // 2
+        cut = slice(first, first + count)
+        planes = [_in_sigma(bands[name][cut, cut]) for name in chosen]
+        picture = make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0)
+        half = count * scale / 2
+        axes.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
+        found = objects.get(survey)
+        if found is not None and len(found):
+            x, y = (found[name].to_numpy() * scale - side * scale / 2 for name in ("x", "y"))
+            axes.scatter(x, y, s=26, facecolors="none", edgecolors="white", linewidths=0.35)
+        axes.set_xlim(-half, half)
+        axes.set_ylim(-half, half)
+        axes.set_title(f"{survey}: {', '.join(chosen)}; {scale:g} arcsec pixels")
+        axes.set_xlabel("arcsec west")
+    return _png(figure)
+
+
+def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
+    """Return, for each survey, the weight and the number of exposures of a tile in one band: (weight, nimages, band)."""
+    figure = _figure(4.2 * 2 * len(tiles), 3.9)
+    position = 0
+    for survey, (weight, count, band) in tiles.items():
+        for values, name in ((weight, "weight"), (count, "exposures")):
+            position += 1
+            axes = figure.add_subplot(1, 2 * len(tiles), position)
+            step = max(1, values.shape[0] // 800)
+            shown = axes.imshow(values[::step, ::step], origin="lower", interpolation="nearest")
+            axes.set_title(f"{survey} {band} {name}", fontsize=10)
+            axes.set_axis_off()
+            figure.colorbar(shown, ax=axes, fraction=0.046)
+    return _png(figure)
+
+
+def magnitude_histograms(true: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> bytes:
+    """Return histograms of true and measured magnitudes, a panel a band."""
+    bands = list(true)
+    figure = _figure(14, 2.9 * -(-len(bands) // 5))
+    edges = np.arange(16, 31.01, 0.5)
+    for position, band in enumerate(bands):
+        axes = figure.add_subplot(-(-len(bands) // 5), 5, position + 1)
+        axes.hist(true[band][np.isfinite(true[band])], edges, histtype="step", color="0.35", label="true, all")
+        found = measured[band]
+        axes.hist(found[np.isfinite(found)], edges, color="tab:blue", alpha=0.5, label="measured")
+        axes.set_yscale("symlog", linthresh=1)
+        axes.set_title(band, fontsize=10)
+        axes.set_xlabel("AB mag")
+        if position == 0:
+            axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def size_magnitude(objects: dict[str, pd.DataFrame], bands: dict[str, str]) -> bytes:
+    """Return the half-light radius against magnitude for each survey; point-like objects in colour."""
+    figure = _figure(6 * len(objects), 4.2)
+    for position, (survey, frame) in enumerate(objects.items()):
+        axes = figure.add_subplot(1, len(objects), position + 1)
+        magnitude = ab_magnitude(frame[f"{bands[survey]}_kronFlux"])
+        extended = frame["extendedness"].to_numpy() > 0
+        for chosen, colour, name in ((extended, "0.5", "extended"), (~extended, "tab:red", "point-like")):
+            axes.scatter(magnitude[chosen], frame["half_light_radius"][chosen], s=7, color=colour, label=name)
+        axes.set_yscale("log")
+        axes.set_xlabel(f"{survey} {bands[survey]}, Kron AB mag")
+        axes.set_ylabel("half-light radius, arcsec")
+        axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
+    """Return the blend matrix: log number of groups by Roman (rows) and Rubin (columns) objects."""
+    shown = counts[counts.index <= 9][[c for c in counts.columns if c <= 6]]
+    figure = _figure(1.6 + 0.8 * max(3, shown.shape[1]), 1.4 + 0.5 * max(3, shown.shape[0]))
+    axes = figure.add_subplot()
+    values = shown.to_numpy(float)
+    axes.imshow(np.log10(values + 1), origin="lower", cmap="Blues", aspect="auto")
+    for row, column in np.ndindex(values.shape):
+        dark = np.log10(values[row, column] + 1) > 0.6 * np.log10(values.max() + 1)
+        axes.text(column, row, f"{int(values[row, column])}", ha="center", va="center", color="white" if dark else "black")
+    axes.set_xticks(range(shown.shape[1]), [str(value) for value in shown.columns])
+    axes.set_yticks(range(shown.shape[0]), [str(value) for value in shown.index])
+    axes.set_xlabel("Rubin objects in the group")
+    axes.set_ylabel("Roman objects")
+    axes.set_title(f"groups at {length:g} arcsec", fontsize=10)
+    return _png(figure)
+
+
+def blend_fraction(tables: dict[float, pd.DataFrame]) -> bytes:
+    """Return the fraction of unrecognised blends against i magnitude, with binomial errors, by linking length."""
+    figure = _figure(6.5, 4)
+    axes = figure.add_subplot()
+    for length, table in tables.items():
+        good = table[table["rubin_objects"] > 0]
+        middle = (good["i_mag_low"] + good["i_mag_high"]) / 2
+        error = np.sqrt(good["fraction"] * (1 - good["fraction"]) / good["rubin_objects"])
+        axes.errorbar(middle, good["fraction"], error, marker="o", capsize=2, label=f"{length:g} arcsec")
+    axes.set_xlabel("Rubin i, Kron AB mag")
+    axes.set_ylabel("unrecognised blends / Rubin objects")
+    axes.set_ylim(0, 1)
+    axes.legend()
+    return _png(figure)
+
+
+def ab_magnitude(flux) -> np.ndarray:
+    """Return AB magnitudes of flux densities in nJy; NaN where not positive."""
+    flux = np.asarray(flux, float)
+    return np.where(flux > 0, 31.4 - 2.5 * np.log10(np.where(flux > 0, flux, 1.0)), np.nan)
+
+
+def _in_sigma(plane: np.ndarray) -> np.ndarray:
+    """Return an image in units of its own noise (median absolute deviation)."""
+    sigma = 1.4826 * np.median(np.abs(plane - np.median(plane)))
+    return plane / (sigma if sigma > 0 else 1.0)
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

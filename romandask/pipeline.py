@@ -1,0 +1,92 @@
+"""A pipeline: the settings of one survey, from a YAML file or the name of one that came with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import Field
+
+from romandask.instruments.exposure import Instrument
+from romandask.instruments.roman import Roman, RomanSettings
+from romandask.instruments.rubin import Rubin, RubinSettings
+from romandask.model.config import (
+    CoaddSettings,
+    DetectionSettings,
+    MatchSettings,
+    RegionSettings,
+    RenderSettings,
+    RunSettings,
+    Section,
+    TruthSettings,
+    apply_overrides,
+    read_yaml,
+    validate,
+)
+from romandask.model.errors import UserError
+from romandask.model.resources import resource_folder
+
+
+class Pipeline(Section):
+    """Everything that decides what a survey contains. A block is named after its instrument; leave it out to leave it out."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    description: str = ""
+    seed: int = Field(ge=0)
+    data: str = Field(".", description="folder that the paths of source files are below")
+    region: RegionSettings
+    truth: TruthSettings = TruthSettings()
+    render: RenderSettings = RenderSettings()
+    roman: RomanSettings | None = None
+    rubin: RubinSettings | None = None
+    coadds: CoaddSettings = CoaddSettings()
+    detections: DetectionSettings = DetectionSettings()
+    matches: MatchSettings = MatchSettings()
+    run: RunSettings = RunSettings()
+
+    def instruments(self) -> dict[str, Instrument]:
+        """Return the instruments of this survey by name, in order."""
+        found: dict[str, Instrument] = {}
+        if self.roman is not None:
+            found["roman"] = Roman(self.roman, self.render.n_waves)
+        if self.rubin is not None:
+            found["rubin"] = Rubin(self.rubin, self.render.n_waves)
+        return found
+
+    def to_yaml(self) -> str:
+        """Return the resolved settings as YAML."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def load_pipeline(source: str | Path, overrides: list[str] | None = None) -> Pipeline:
+    """Return the settings of a YAML file, or of a pipeline that came with the package, with overrides applied.
+
+    Raises
+    ------
+    UserError
+        Naming the file and every key that is unknown (with the nearest valid one), missing or wrong.
+    """
+    path = Path(source)
+    content = apply_overrides(read_yaml(_find(path)), overrides or [])
+    return validate(Pipeline, content, str(source))
+
+
+def pipeline_of(content: dict[str, Any], source: str) -> Pipeline:
+    """Return the settings of a mapping."""
+    return validate(Pipeline, content, source)
+
+
+def shipped() -> list[str]:
+    """Return the names of the pipelines that came with the package."""
+    return sorted(path.stem for path in resource_folder("pipelines").glob("*.yaml"))
+
+
+def _find(path: Path) -> Path:
+    if path.is_file():
+        return path
+    inside = resource_folder("pipelines") / f"{path.name.removesuffix('.yaml')}.yaml"
+    # a name, or the path that it has in the project's own folder
+    if inside.is_file() and str(path.parent) in (".", "pipelines"):
+        return inside
+    raise UserError(f"{path}: no such pipeline file; the package has {', '.join(shipped())}")

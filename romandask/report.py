@@ -1,0 +1,168 @@
+"""The report: one HTML page without external assets, and the picture of the stages."""
+
+from __future__ import annotations
+
+import base64
+import html
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from romandask import pictures
+from romandask.flow import Planned, run_figures, stored_versions
+from romandask.survey import Survey
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2em auto; padding: 0 1em; color: #1c2430; }
+h1 { margin-bottom: 0 } h2 { margin-top: 2em; border-bottom: 1px solid #d5dbe3 }
+img { max-width: 100%; height: auto } figure { margin: 1em 0 } figcaption { color: #55606e; font-size: 13px }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums } td, th { padding: 2px 12px; text-align: right }
+th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align: left }
+"""
+
+
+def write_report(survey: Survey) -> Path:
+    """Write the page of a stored survey and return where it is."""
+    assert survey.store is not None
+    objects = {name: survey.object_product(name).all_rows() for name in survey.instruments}
+    busiest = _busiest_tile(survey, objects)
+    sections = [
+        _overview(survey, objects),
+        _sky(survey, objects, busiest),
+        _measurements(survey, objects),
+        _blends(survey),
+        _figures_of_the_run(survey),
+    ]
+    title = html.escape(f"romandask: {survey.pipeline.name}")
+    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    path = survey.store.report / "index.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page + "".join(sections) + "</html>\n")
+    return path
+
+
+def dag_svg(rows: list[Planned], path: Path) -> None:
+    """Write the stages of a plan as an SVG picture: a box a stage, its units and bytes, in the order they run."""
+    groups: dict[str, list[Planned]] = {}
+    for row in rows:
+        groups.setdefault(row.stage.split("/")[0], []).append(row)
+    figure = Figure(figsize=(2.6 * len(groups), 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    centres = []
+    for column, (kind, members) in enumerate(groups.items()):
+        lines = [kind] + [f"{row.stage.split('/')[1]}: {row.units}" for row in members]
+        axes.text(column, 0, "\n".join(lines), ha="center", va="center", bbox={"boxstyle": "round", "fc": "#e8eef6", "ec": "#45607f"})
+        centres.append(column)
+    for left in centres[:-1]:
+        axes.annotate("", (left + 0.68, 0), (left + 0.36, 0), arrowprops={"arrowstyle": "->"})
+    axes.set_xlim(-0.5, len(groups) - 0.5)
+    axes.set_ylim(-1, 1)
+    axes.set_axis_off()
+    figure.savefig(path, format="svg")
+
+
+def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
+    region = survey.region
+    text = (
+        f"<p>{html.escape(survey.pipeline.description)}</p><p>Region: RA {region.ra_min:g} to {region.ra_max:g}, Dec "
+        f"{region.dec_min:g} to {region.dec_max:g} degrees; true solid angle {region.area:.3f} arcmin<sup>2</sup>; "
+        f"{len(survey.tiles)} tiles.</p>"
+    )
+    rows = []
+    for name, frame in objects.items():
+        count = len(survey.pointings(name))
+        rows.append({"survey": name, "exposures": count, "objects": len(frame), "objects / arcmin2": f"{len(frame) / region.area:.1f}"})
+    return text + _table(pd.DataFrame(rows))
+
+
+def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
+    pairs, layers = {}, {}
+    for name, instrument in survey.instruments.items():
+        product = survey.coadd_product(name)
+        bands = {}
+        for position, band in enumerate(instrument.bands):
+            arrays = product.load(tile * len(instrument.bands) + position, ("image", "weight", "nimages"))
+            bands[band] = arrays["image"]
+            if position == len(instrument.bands) // 2:
+                layers[name] = (arrays["weight"], arrays["nimages"], band)
+        pairs[name] = (bands, instrument.coadd_scale)
+    label = survey.tiles[tile].name
+    circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
+    return (
+        "<h2>The same sky</h2>"
+        + _image(pictures.colour_pair(pairs, circled), f"Tile {label} as each survey sees it. Circles: objects that the tile owns.")
+        + _image(pictures.maps(layers), "Weight and number of exposures of the tile.")
+    )
+
+
+def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
+    catalogs = survey.truth_catalogs
+    truth = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
+    truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
+    true, measured, middle = {}, {}, {}
+    for name, instrument in survey.instruments.items():
+        middle[name] = instrument.bands[len(instrument.bands) // 2]
+        for band in instrument.bands:
+            true[band] = pictures.ab_magnitude(pd.concat([frame[f"flux_{band}"] for frame in truth]))
+            measured[band] = pictures.ab_magnitude(objects[name][f"{band}_kronFlux"])
+    return (
+        "<h2>Measurements</h2>"
+        + _image(pictures.magnitude_histograms(true, measured), "Magnitudes: all true objects of the region, and Kron magnitudes of the detected.")
+        + _image(pictures.size_magnitude(objects, middle), "Size and magnitude; point sources form the locus at the PSF's size.")
+    )
+
+
+def _blends(survey: Survey) -> str:
+    lengths = survey.pipeline.matches.linking_lengths
+    statistics = survey.statistics
+    text = "<h2>Blends</h2><p>Friends of friends over the objects of both surveys. Rows: Roman, columns: Rubin.</p>"
+    for length in lengths:
+        counts = statistics.blends(length)
+        if counts.size:
+            text += _image(pictures.blend_matrix(counts, length), f"Numbers of groups at a linking length of {length:g} arcsec.")
+    tables = {length: statistics.unrecognised(length) for length in lengths}
+    for length, table in tables.items():
+        objects, blends = int(table["rubin_objects"].sum()), int(table["blends"].sum())
+        share = f"{blends / objects:.1%}" if objects else "none"
+        text += (
+            f"<p>At {length:g} arcsec {blends} of {objects} Rubin objects with a Roman counterpart are unrecognised blends "
+            f"({share}): alone of Rubin in a group with two or more Roman objects.</p>"
+        )
+    return text + _image(pictures.blend_fraction(tables), "Unrecognised blends against i magnitude; errors are binomial.")
+
+
+def _figures_of_the_run(survey: Survey) -> str:
+    assert survey.store is not None
+    figures = pd.DataFrame(run_figures(survey.store))
+    shown = pd.DataFrame(
+        {
+            "stage": figures["stage"],
+            "units": figures["units"],
+            "rows or pixels": figures["rows"],
+            "seconds of work": figures["seconds"].map("{:.1f}".format),
+            "MB uncompressed": (figures["bytes"] / 1e6).map("{:.1f}".format),
+            "peak worker GiB": (figures["peak_bytes"] / 2**30).map("{:.2f}".format),
+            "warnings": figures["warnings"],
+        }
+    )
+    disk = sum(path.stat().st_size for path in survey.store.root.rglob("*") if path.is_file())
+    versions = ", ".join(f"{name} {number}" for name, number in stored_versions(survey.store).items())
+    return (
+        "<h2>The run</h2>" + _table(shown) + f"<p>On disk: {disk / 1e6:.0f} MB. Made with {html.escape(versions)}.</p>"
+    )
+
+
+def _busiest_tile(survey: Survey, objects: dict[str, pd.DataFrame]) -> int:
+    names = [tile.name for tile in survey.tiles]
+    counts = sum(frame["tile"].value_counts().reindex(names, fill_value=0) for frame in objects.values())
+    return names.index(counts.idxmax())
+
+
+def _image(png: bytes, caption: str) -> str:
+    data = base64.b64encode(png).decode()
+    return f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+
+
+def _table(frame: pd.DataFrame) -> str:
+    return frame.to_html(index=False, border=0)

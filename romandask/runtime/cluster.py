@@ -1,0 +1,165 @@
+"""Running units: on a local cluster of one-thread processes, on an existing cluster, or in this process.
+
+The only module that knows distributed.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import dask
+from distributed import Client, LocalCluster, as_completed
+
+from romandask.model.errors import UserError
+from romandask.runtime.manifest import Record
+from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.store import Store
+from romandask.runtime.work import Task, make_unit
+
+ATTEMPTS = 3
+"""A unit that fails this often is set aside."""
+WAVE = 4
+"""Units in flight a worker: enough to keep it busy, few enough that nothing piles up."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a unit: its record, or the text of its last failure."""
+
+    index: int
+    record: Record | None
+    failure: str | None = None
+
+
+class Runner(Protocol):
+    """Runs the units of a product."""
+
+    description: str
+
+    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
+        """Yield what became of each unit, as they end."""
+
+
+class InProcess:
+    """Runs units one after another in this process, for debugging."""
+
+    description = "in this process"
+
+    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
+        """Yield what became of each unit; a failure is not tried again."""
+        for task in tasks:
+            try:
+                yield Outcome(task.index, make_unit(product, task, store))
+            except Exception:
+                yield Outcome(task.index, None, traceback.format_exc())
+
+
+class OnCluster:
+    """Runs units on a dask cluster, in bounded waves, long units first; results are released at once."""
+
+    def __init__(self, client: Client, description: str):
+        self._client = client
+        self.description = description
+
+    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
+        """Yield what became of each unit; one that fails is tried up to three times."""
+        waiting = sorted(tasks, key=lambda task: (-task.cost, task.index))[::-1]
+        tries = {task.index: 0 for task in tasks}
+        # the product goes to every worker once; a task carries only its number and its hash
+        shared = self._client.scatter(product, broadcast=True, hash=False)
+        futures: dict[Any, Task] = {}
+        flow = as_completed([], with_results=False)
+
+        def submit() -> None:
+            room = WAVE * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+            while waiting and len(futures) < room:
+                task = waiting.pop()
+                tries[task.index] += 1
+                name = product.stage.replace("/", "-")
+                key = f"{name}-{product.units[task.index].name}-{product.units[task.index].name}.{tries[task.index]}"
+                future = self._client.submit(make_unit, shared, task, store, key=key, pure=False)
+                futures[future] = task
+                flow.add(future)
+
+        try:
+            submit()
+            while futures:
+                future = next(flow)
+                task = futures.pop(future)
+                if future.status == "finished":
+                    outcome = Outcome(task.index, future.result())
+                else:
+                    outcome = Outcome(task.index, None, _failure(future))
+                future.release()
+                if outcome.record is None and tries[task.index] < ATTEMPTS:
+                    waiting.append(task)
+                else:
+                    yield outcome
+                submit()
+        finally:
+            if futures:
+                self._client.cancel(list(futures), force=True)
+
+
+def _failure(future: Any) -> str:
+    error = future.exception()
+    lines = traceback.format_exception(type(error), error, future.traceback())
+    return "".join(lines)
+
+
+@contextmanager
+def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> Iterator[Runner]:
+    """Yield a runner: on the cluster at `scheduler`, on `workers` local processes, or, for 0, in this process.
+
+    Parameters
+    ----------
+    memory_limit : GiB a local worker
+    """
+    if scheduler is None and workers == 0:
+        yield InProcess()
+        return
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout="20s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise UserError(f"--scheduler {scheduler}: no dask scheduler answers there ({type(error).__name__})") from None
+        with client:
+            yield OnCluster(client, f"cluster at {scheduler}, dashboard {client.dashboard_link}")
+        return
+    quiet = {
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.target": False,
+        "distributed.admin.large-graph-warning-threshold": "100MB",
+    }
+    with dask.config.set(quiet), LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=f"127.0.0.1:{_free_port(8787)}",
+        memory_limit=int(memory_limit * 2**30),
+        silence_logs=50,
+    ) as cluster, Client(cluster) as client:
+        yield OnCluster(client, f"{workers} local workers, dashboard {cluster.dashboard_link}")
+
+
+def _free_port(wanted: int) -> int:
+    """Return a port of the loopback if it is free, else 0 (any)."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", wanted))
+        except OSError:
+            return 0
+    return wanted
+
+
+def available_memory() -> int:
+    """Return the memory of this machine, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,0 +1,43 @@
+"""Making one unit: the function that a task runs, in a worker or in this process."""
+
+from __future__ import annotations
+
+import resource
+import time
+import warnings
+from dataclasses import dataclass
+
+from romandask.runtime.manifest import Record, write_record
+from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.store import Store
+
+
+@dataclass(frozen=True)
+class Task:
+    """One unit to make."""
+
+    index: int
+    inputs: str
+    """Hash of what it depends on."""
+    cost: float
+
+
+def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store) -> Record:
+    """Make and write one unit, then its record: what a crash leaves in between is made again."""
+    start = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        made = product.write(task.index, store)
+    record = Record(
+        stage=product.stage,
+        unit=product.units[task.index].name,
+        inputs=task.inputs,
+        output=made.output,
+        bytes=made.bytes,
+        rows=made.rows,
+        seconds=round(time.perf_counter() - start, 3),
+        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        warnings=sorted({f"{item.category.__name__}: {item.message}" for item in caught}),
+    )
+    write_record(store, record)
+    return record

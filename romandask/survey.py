@@ -1,0 +1,263 @@
+"""A survey: a pipeline and a store; its products by name, lazy, read where they are stored and made where not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import dask.dataframe as dd
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from romandask.coadds import coadds
+from romandask.detections import detections, objects
+from romandask.exposures import exposures
+from romandask.instruments.exposure import Instrument, exposure_of
+from romandask.matches import Matches, matches
+from romandask.model.errors import UserError
+from romandask.model.sky import Region
+from romandask.model.spectra import Bandpass
+from romandask.model.tiles import Tile
+from romandask.pipeline import Pipeline, load_pipeline
+from romandask.pointings import corners_of, pointings
+from romandask.runtime.manifest import read_record
+from romandask.runtime.products import ImageProduct, TableProduct, Unit, conform, to_frame
+from romandask.runtime.schemas import schema
+from romandask.runtime.store import Store, read_parquet
+from romandask.statistics import Statistics, matrix, statistics
+from romandask.truth import TruthCatalogs, truth
+
+
+class Survey:
+    """The products of one survey.
+
+    Parameters
+    ----------
+    pipeline : its settings
+    store : where its units are kept; None to make everything on demand
+    """
+
+    def __init__(self, pipeline: Pipeline, store: Store | None = None):
+        self.pipeline = pipeline
+        self.store = store
+        self._pointings: dict[str, pd.DataFrame] = {}
+
+    # ---- what users ask for
+
+    def truth(self, kind: str) -> dd.DataFrame:
+        """Return the lazy truth catalog `galaxies` or `stars` (schema: catalogs/<kind>.yaml)."""
+        return self._one(vars(self.truth_catalogs), kind, ("galaxies", "stars", "quarantine")).frame
+
+    def pointings(self, survey: str) -> pd.DataFrame:
+        """Return the exposures of an instrument, one row a visit and detector."""
+        if survey not in self._pointings:
+            self._pointings[survey] = self._read_pointings(survey)
+        return self._pointings[survey]
+
+    def exposures(self, survey: str) -> xr.Dataset:
+        """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ..."""
+        return self.exposure_product(survey).dataset
+
+    def coadds(self, survey: str) -> xr.Dataset:
+        """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, psf; coords tile, band, header ..."""
+        return self.coadd_product(survey).dataset
+
+    def objects(self, survey: str) -> dd.DataFrame:
+        """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
+        return self.object_product(survey).frame
+
+    def matches(self) -> dd.DataFrame:
+        """Return the lazy friends-of-friends groups of all objects (schema: catalogs/groups.yaml)."""
+        return self.match_products.groups.frame
+
+    @property
+    def statistics(self) -> SurveyStatistics:
+        """Statistics of the groups."""
+        return SurveyStatistics(self.statistic_products, self.pipeline.matches.linking_lengths)
+
+    def __repr__(self) -> str:
+        place = self.store.root if self.store else "not stored"
+        lines = [f"Survey {self.pipeline.name} ({place})"]
+        if self.store:
+            for folder in sorted((self.store.root / "manifest").glob("*/*")):
+                stage = f"{folder.parent.name}/{folder.name}"
+                paths = self.store.records(stage)
+                records = [record for path in paths if (record := read_record(self.store, stage, path.stem))]
+                size = sum(record.bytes for record in records)
+                lines.append(f"  {stage:20s} {len(records):6d} units {size / 1e6:12.1f} MB")
+        return "\n".join(lines)
+
+    # ---- the products behind them
+
+    @cached_property
+    def region(self) -> Region:
+        """The box on the sky."""
+        return self.pipeline.region.region()
+
+    @cached_property
+    def instruments(self) -> dict[str, Instrument]:
+        """Instruments by name."""
+        return self.pipeline.instruments()
+
+    @cached_property
+    def tiles(self) -> list[Tile]:
+        """The tiles whose unique areas touch the region."""
+        return self.pipeline.coadds.grid().covering(self.region)
+
+    @cached_property
+    def bandpasses(self) -> dict[str, Bandpass]:
+        """All bands of all instruments; the truth holds a flux for each."""
+        return {band: instrument.bandpass(band) for instrument in self.instruments.values() for band in instrument.bands}
+
+    @property
+    def data(self) -> Path:
+        """The folder that source files are below."""
+        return Path(self.pipeline.data)
+
+    @cached_property
+    def truth_catalogs(self) -> TruthCatalogs:
+        """The truth catalogs."""
+        settings = self.pipeline
+        made = truth(settings.truth, self.data, self.region, self.bandpasses, settings.seed)
+        if self.store is None:
+            return made
+        tables = {name: getattr(made, name).stored(self.store) for name in ("galaxies", "stars", "quarantine")}
+        return replace(made, **tables)
+
+    def pointing_product(self, survey: str) -> TableProduct:
+        """The pointings as a product of one unit."""
+        settings = self.pipeline
+        block = getattr(settings, survey)
+        state = {
+            "settings": block.model_dump(), "region": settings.region.model_dump(), "seed": settings.seed,
+            "coadds": settings.coadds.model_dump(exclude={"pixfrac"}), "source": _state(self.data, block.pointings.path),
+        }  # fmt: skip
+        return self._stored(
+            TableProduct(
+                f"pointings/{survey}", (Unit("all", state),), _MakePointings(self, survey), schema("pointings"), bytes_per_unit=1 << 30
+            )
+        )
+
+    def exposure_product(self, survey: str) -> ImageProduct:
+        """The exposures of an instrument."""
+        instrument = self._instrument(survey)
+        table = self.pointings(survey)
+        return self._stored(exposures(table, self.truth_catalogs, instrument, self.pipeline.render, self.pipeline.seed))
+
+    def coadd_product(self, survey: str) -> ImageProduct:
+        """The coadds of an instrument."""
+        return self._stored(coadds(self.exposure_product(survey), self.tiles, self.pipeline.coadds))
+
+    def detection_product(self, survey: str) -> TableProduct:
+        """The detections of each tile."""
+        return self._stored(detections(self.coadd_product(survey), self.pipeline.detections, self.region))
+
+    def object_product(self, survey: str) -> TableProduct:
+        """The object table."""
+        product = self.coadd_product(survey)
+        return self._stored(objects(self.detection_product(survey), product, self.pipeline.detections, self.region))
+
+    @property
+    def match_products(self) -> Matches:
+        """The stages of friends of friends."""
+        tables = {name: self.object_product(name) for name in self.instruments}
+        return matches(tables, self.pipeline.matches, self.region, self.store)
+
+    @property
+    def statistic_products(self) -> Statistics:
+        """The tables of the statistics stage."""
+        made = statistics(self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths)
+        return Statistics(self._stored(made.blends), self._stored(made.unrecognised))
+
+    def footprints(self, survey: str) -> np.ndarray:
+        """Return the corners (n, 4, 2), degrees, of the exposures of an instrument."""
+        return corners_of(self.pointings(survey))
+
+    def header(self, survey: str, row: int) -> dict:
+        """Return the FITS header of an exposure."""
+        return self._instrument(survey).header(exposure_of(self.pointings(survey).iloc[row]))
+
+    def make_pointings(self, survey: str) -> pd.DataFrame:
+        """Return the pointings made afresh, whatever the store has."""
+        settings = self.pipeline
+        block, grid = getattr(settings, survey), settings.coadds.grid()
+        instrument = self._instrument(survey)
+        frame = pointings(instrument, block.pointings, self.data, self.region, self.tiles, grid.side, settings.seed)
+        return to_frame(conform(frame, schema("pointings"), f"pointings/{survey}"))
+
+    def _read_pointings(self, survey: str) -> pd.DataFrame:
+        self._instrument(survey)
+        stage = f"pointings/{survey}"
+        if self.store is not None and read_record(self.store, stage, "all"):
+            return to_frame(read_parquet(self.store.table(stage, "all")))
+        return self.make_pointings(survey)
+
+    def _instrument(self, survey: str) -> Instrument:
+        return self._one(self.instruments, survey, tuple(self.instruments))
+
+    def _one(self, mapping, name: str, valid: tuple[str, ...]):
+        if name not in valid:
+            raise UserError(f"{name!r}: this survey has {', '.join(valid)}")
+        return mapping[name]
+
+    def _stored(self, product):
+        return product if self.store is None else product.stored(self.store)
+
+
+class SurveyStatistics:
+    """Statistics of the groups, as tables."""
+
+    def __init__(self, products: Statistics, lengths: tuple[float, ...]):
+        self._products = products
+        self._lengths = lengths
+
+    def blends(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return the blend matrix: numbers of groups by Roman objects (rows) and Rubin objects (columns)."""
+        return matrix(self._products.blends.all_rows(), self._length(linking_length))
+
+    def unrecognised(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return unrecognised blends by i magnitude (schema: catalogs/unrecognised.yaml)."""
+        table = self._products.unrecognised.all_rows()
+        return table[np.isclose(table["linking_length"], self._length(linking_length))].reset_index(drop=True)
+
+    def _length(self, length: float | None) -> float:
+        length = self._lengths[0] if length is None else length
+        if not np.isclose(length, self._lengths).any():
+            raise UserError(f"linking length {length}: this survey has {', '.join(map(str, self._lengths))} arcsec")
+        return length
+
+
+class _MakePointings:
+    """Makes the pointings of one instrument; holds the pipeline alone, so that it travels light."""
+
+    def __init__(self, survey: Survey, name: str):
+        self._pipeline, self._name = survey.pipeline, name
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        return Survey(self._pipeline).make_pointings(self._name)
+
+
+def _state(data: Path, path: str | None):
+    """Return what identifies the content of a source file without reading it."""
+    if path is None:
+        return None
+    file = data / path
+    return (path, file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else (path,)
+
+
+def open_survey(path: str | Path) -> Survey:
+    """Open a stored survey.
+
+    Raises
+    ------
+    UserError
+        If the folder is not a store.
+    """
+    store = Store(Path(path))
+    if not store.pipeline.is_file():
+        raise UserError(f"{path}: not a romandask store (it has no pipeline.yaml); make one with romandask run")
+    return Survey(load_pipeline(store.pipeline), store)
+
+

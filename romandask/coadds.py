@@ -131,9 +131,12 @@ class DrizzleTile:
             arrays = self.exposures.load(int(i), ("image", "dq"))
             good = arrays["dq"] & (SATURATED | NO_DATA) == 0
             light = subtract_background(arrays["image"], ~good)[here]
-            per_area = (to_njy / exposure.exptime) / pixel_areas(header, instrument.shape)[here]
-            random = rng(source.seed, "coadds", "noise", instrument.name, exposure.visit, exposure.detector)
-            noise = noise_realisation(instrument.background(exposure, header), instrument.detector, random)[here]
+            per_area = (to_njy / exposure.exptime) / pixel_areas(header, instrument.shape, *here)
+            identity = ("noise", instrument.name, exposure.visit, exposure.detector)
+            noise = noise_realisation(
+                instrument.background(exposure, header, *here), instrument.detector, instrument.shape[1], *here,
+                lambda block, identity=identity: rng(source.seed, "coadds", *identity, block),
+            )  # fmt: skip
             weight = np.float32(exposure.exptime) * good[here]
             sums.add([light * per_area, noise * per_area], weight, part.pixmap)
             _add_star(psf, instrument, exposure, wcs, tile, side)

@@ -12,13 +12,11 @@ import pandas as pd
 from romandask.formats import obseq, opsim
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of
 from romandask.model.errors import UserError
-from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
+from romandask.model.sky import Region, chord, radec, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile
 
 READERS: dict[str, Callable[[Path], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
-FIELD_RADIUS = 1.9
-"""No detector of any instrument lies further from the boresight, degrees."""
 
 
 def pointings(
@@ -46,7 +44,7 @@ def pointings(
         origin = f"{instrument.name}.pointings ({settings.source})"
     visits = visits[visits["band"].isin(instrument.bands)]
     corners = np.stack([tile.corners(side) for tile in tiles])
-    rows = _exposures(instrument, visits[_near(visits, corners)], corners)
+    rows = _exposures(instrument, visits[_near(visits, corners, instrument.field_radius)], corners)
     missing = [band for band in instrument.bands if band not in set(rows["band"])]
     if missing:
         ra, dec = region.centre
@@ -62,26 +60,32 @@ def corners_of(table: pd.DataFrame) -> np.ndarray:
     return table[list(CORNERS)].to_numpy(float).reshape(-1, 4, 2)
 
 
-def _near(visits: pd.DataFrame, corners: np.ndarray) -> np.ndarray:
+def _near(visits: pd.DataFrame, corners: np.ndarray, radius: float) -> np.ndarray:
     """True where a visit's field may reach a tile."""
     vectors = unit_vectors(visits["ra"], visits["dec"])
     tiles = unit_vectors(corners[..., 0], corners[..., 1]).reshape(-1, 3)
     centre = tiles.mean(axis=0)
     spread = np.linalg.norm(tiles - centre, axis=1).max()
-    return np.linalg.norm(vectors - centre, axis=1) < spread + chord(FIELD_RADIUS * 3600)
+    return np.linalg.norm(vectors - centre, axis=1) < spread + chord(radius * 3600)
 
 
 def _exposures(instrument: Instrument, visits: pd.DataFrame, corners: np.ndarray) -> pd.DataFrame:
+    vectors = unit_vectors(corners[..., 0], corners[..., 1]).reshape(-1, 3)
+    middle = vectors.mean(axis=0) / np.linalg.norm(vectors.mean(axis=0))
+    ra, dec = (float(value) for value in radec(middle))
+    radius = np.degrees(2 * np.arcsin(np.linalg.norm(vectors - middle, axis=1).max() / 2))
     rows: list[dict] = []
     for _, visit in visits.assign(detector=0).iterrows():
         first = exposure_of(visit)
         try:
-            footprints = instrument.footprints(first)
+            footprints = instrument.footprints(first, ra, dec, radius)
         except (ValueError, RuntimeError) as error:
             raise UserError(
                 f"{instrument.name} visit {first.visit} (MJD {first.mjd:.2f}, ra {first.ra:.3f}, dec {first.dec:.3f}): "
                 f"cannot be pointed: {error}"
             ) from None
+        if not footprints:
+            continue
         detectors = list(footprints)
         touching, _ = touching_pairs(np.stack(list(footprints.values())), corners)
         for k in np.unique(touching):

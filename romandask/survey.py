@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import dask.dataframe as dd
 import numpy as np
@@ -42,7 +44,7 @@ class Survey:
     def __init__(self, pipeline: Pipeline, store: Store | None = None):
         self.pipeline = pipeline
         self.store = store
-        self._pointings: dict[str, pd.DataFrame] = {}
+        self._made: dict[tuple[str, str], Any] = {}
 
     # ---- what users ask for
 
@@ -52,9 +54,7 @@ class Survey:
 
     def pointings(self, survey: str) -> pd.DataFrame:
         """Return the exposures of an instrument, one row a visit and detector."""
-        if survey not in self._pointings:
-            self._pointings[survey] = self._read_pointings(survey)
-        return self._pointings[survey]
+        return self._once("pointings", survey, lambda: self._read_pointings(survey))
 
     def exposures(self, survey: str) -> xr.Dataset:
         """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ..."""
@@ -142,28 +142,43 @@ class Survey:
 
     def exposure_product(self, survey: str) -> ImageProduct:
         """The exposures of an instrument."""
-        instrument = self._instrument(survey)
-        table = self.pointings(survey)
-        return self._stored(exposures(table, self.truth_catalogs, instrument, self.pipeline.render, self.pipeline.seed))
+        instrument, settings = self._instrument(survey), self.pipeline
+        return self._once(
+            "exposures",
+            survey,
+            lambda: exposures(self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed),
+        )
 
     def coadd_product(self, survey: str) -> ImageProduct:
         """The coadds of an instrument."""
-        return self._stored(coadds(self.exposure_product(survey), self.tiles, self.pipeline.coadds))
+        self._instrument(survey)
+        return self._once(
+            "coadds", survey, lambda: coadds(self.exposure_product(survey), self.tiles, self.pipeline.coadds)
+        )
 
     def detection_product(self, survey: str) -> TableProduct:
         """The detections of each tile."""
-        return self._stored(detections(self.coadd_product(survey), self.pipeline.detections, self.region))
+        settings = self.pipeline.detections
+        return self._once(
+            "detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region)
+        )
 
     def object_product(self, survey: str) -> TableProduct:
         """The object table."""
-        product = self.coadd_product(survey)
-        return self._stored(objects(self.detection_product(survey), product, self.pipeline.detections, self.region))
+        settings = self.pipeline.detections
+        return self._once(
+            "objects",
+            survey,
+            lambda: objects(self.detection_product(survey), self.coadd_product(survey), settings, self.region),
+        )
 
     @property
     def match_products(self) -> Matches:
         """The stages of friends of friends."""
         tables = {name: self.object_product(name) for name in self.instruments}
-        return matches(tables, self.pipeline.matches, self.region, self.store)
+        return self._once(
+            "matches", "all", lambda: matches(tables, self.pipeline.matches, self.region, self.store)
+        )
 
     @property
     def statistic_products(self) -> Statistics:
@@ -202,8 +217,15 @@ class Survey:
             raise UserError(f"{name!r}: this survey has {', '.join(valid)}")
         return mapping[name]
 
+    def _once(self, kind: str, survey: str, make: Callable[[], Any]) -> Any:
+        """Return a product, made at the first asking: with a store it reads what is there."""
+        if (kind, survey) not in self._made:
+            self._made[kind, survey] = self._stored(make())
+        return self._made[kind, survey]
+
     def _stored(self, product):
-        return product if self.store is None else product.stored(self.store)
+        stored = getattr(product, "stored", None)
+        return product if self.store is None or stored is None else stored(self.store)
 
 
 class SurveyStatistics:

@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
-from scipy.interpolate import RectBivariateSpline
+from numpy.polynomial.chebyshev import chebvander
 
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import PsfBasis
@@ -64,6 +64,8 @@ class Instrument(Protocol):
     """Native, arcsec."""
     shape: tuple[int, int]
     """Detector (ny, nx)."""
+    field_radius: float
+    """No detector reaches further from the boresight, degrees."""
     knot_smoothing: float
     """Sigma, arcsec, of the Gaussian that smooths knots of galaxies."""
     detector: Detector
@@ -84,8 +86,8 @@ class Instrument(Protocol):
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
         """Return visits that cover a region: the columns of Exposure without the detector."""
 
-    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
-        """Return the corners (4, 2), degrees, of every detector of a visit (whose own detector is not used)."""
+    def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
+        """Return the corners (4, 2), degrees, of at least those detectors of a visit that reach into a cone (degrees)."""
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact FITS header of an exposure."""
@@ -93,8 +95,8 @@ class Instrument(Protocol):
     def psf(self, exposure: Exposure, size: int) -> PsfBasis:
         """Return the chromatic PSF of an exposure for stamps up to `size` pixels."""
 
-    def background(self, exposure: Exposure, header: dict) -> np.ndarray:
-        """Return the expected electrons (ny, nx) that do not come from objects."""
+    def background(self, exposure: Exposure, header: dict, rows: slice = ..., columns: slice = ...) -> np.ndarray:
+        """Return the expected electrons (ny, nx) that do not come from objects, of all or some pixels."""
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
         """Return the noise of an empty pixel, electrons rms."""
@@ -108,26 +110,32 @@ def footprint(header: dict, shape: tuple[int, int]) -> np.ndarray:
     return np.stack(WCS(header).all_pix2world(x, y, 0), axis=1)
 
 
-def pixel_areas(header: dict, shape: tuple[int, int], step: int = 256) -> np.ndarray:
-    """Return the area (ny, nx), arcsec2, of every pixel.
+WHOLE = slice(None)
 
-    The area varies smoothly (SIP of fourth order): it is computed exactly on a coarse grid and interpolated by cubic
-    splines, to better than 1e-6.
+
+def pixel_areas(
+    header: dict, shape: tuple[int, int], rows: slice = WHOLE, columns: slice = WHOLE, knots: int = 17
+) -> np.ndarray:
+    """Return the area, arcsec2, of the pixels of some rows and columns of an image, (ny, nx) float32.
+
+    The area varies smoothly (SIP of fourth order): it is computed exactly on a coarse grid and interpolated by
+    Chebyshev polynomials of eighth order, to better than 1e-6.
     """
     wcs = WCS(header)
-    ys, xs = (np.unique(np.r_[np.arange(0, n - 1, step), n - 1]).astype(float) for n in shape)
+    ys, xs = (np.linspace(0, n - 1, knots) for n in shape)
     x, y = np.meshgrid(xs, ys)
-    ra = {}
+    sides = {}
     for name, dx, dy in (("e", 0.5, 0), ("w", -0.5, 0), ("n", 0, 0.5), ("s", 0, -0.5)):
-        ra[name] = np.stack(wcs.all_pix2world(x + dx, y + dy, 0))
-    middle = np.radians((ra["e"][1] + ra["w"][1]) / 2)
+        sides[name] = np.stack(wcs.all_pix2world(x + dx, y + dy, 0))
+    middle = np.radians((sides["e"][1] + sides["w"][1]) / 2)
 
     def step_of(a: str, b: str) -> tuple[np.ndarray, np.ndarray]:
-        east = ((ra[a][0] - ra[b][0] + 180) % 360 - 180) * np.cos(middle)
-        return east * 3600, (ra[a][1] - ra[b][1]) * 3600
+        east = ((sides[a][0] - sides[b][0] + 180) % 360 - 180) * np.cos(middle)
+        return east * 3600, (sides[a][1] - sides[b][1]) * 3600
 
     (xe, xn), (ye, yn) = step_of("e", "w"), step_of("n", "s")
     area = np.abs(xe * yn - xn * ye)
-    order = [min(3, len(axis) - 1) for axis in (ys, xs)]
-    spline = RectBivariateSpline(ys, xs, area, kx=order[0], ky=order[1])
-    return spline(np.arange(shape[0]), np.arange(shape[1])).astype(np.float32)
+    left, right = (chebvander(2 * axis / axis[-1] - 1, 8) for axis in (ys, xs))
+    coefficients = np.linalg.pinv(left) @ area @ np.linalg.pinv(right).T
+    at = [np.arange(n)[part] * 2 / (n - 1) - 1 for n, part in zip(shape, (rows, columns), strict=True)]
+    return (chebvander(at[0], 8) @ coefficients).astype(np.float32) @ chebvander(at[1], 8).T.astype(np.float32)

@@ -15,17 +15,19 @@ from coord.util import sun_position_ecliptic
 from galsim.roman.roman_wcs import theta_fpa
 from pydantic import Field
 
-from romandask.instruments.exposure import Exposure, footprint, pixel_areas
+from romandask.instruments.exposure import WHOLE, Exposure, footprint, pixel_areas
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import PsfBasis, sample_basis
 from romandask.model.config import Section
 from romandask.model.errors import UserError
-from romandask.model.sky import Region, from_tangent_plane
+from romandask.model.sky import Region, from_tangent_plane, unit_vectors
 from romandask.model.spectra import Bandpass
 
 SCAS = tuple(range(1, 19))
 SIDE = galsim.roman.n_pix
+SCA_RADIUS = 0.105
+"""From the centre of an SCA to its corners, with a margin for the approximate centre; degrees."""
 EXPTIME = 139.8
 """Seconds."""
 KNOT_SMOOTHING = 0.2
@@ -69,6 +71,7 @@ class Roman:
     """arcsec"""
     pixel_scale: float = galsim.roman.pixel_scale
     shape: tuple[int, int] = (SIDE, SIDE)
+    field_radius: float = 0.6
     knot_smoothing: float = KNOT_SMOOTHING
     detection: Literal["median", "mean"] = "median"
     detection_bands: tuple[str, ...] | None = None
@@ -108,9 +111,19 @@ class Roman:
             visit=np.arange(len(rows)), seeing=np.nan, airmass=np.nan, sky_brightness=np.nan
         )
 
-    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
-        """Return the corners of the 18 SCAs of a visit; ValueError where the Sun is too near or too far."""
-        return {sca: footprint(header, self.shape) for sca, header in _headers(visit, SCAS).items()}
+    def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
+        """Return the corners of the SCAs of a visit that may reach into a cone.
+
+        Raises GalSim's ValueError where the Sun is too near or too far.
+        """
+        # the exact WCS costs milliseconds an SCA: ask only for those whose centre is near enough
+        offsets, angle = _sca_offsets(), np.radians(visit.pa)
+        xi = -offsets[:, 0] * np.cos(angle) + offsets[:, 1] * np.sin(angle)
+        eta = offsets[:, 0] * np.sin(angle) + offsets[:, 1] * np.cos(angle)
+        centres = unit_vectors(*from_tangent_plane(visit.ra, visit.dec, xi, eta))
+        gap = np.linalg.norm(centres - unit_vectors(ra, dec), axis=1)
+        near = tuple(sca for sca, distance in zip(SCAS, gap, strict=True) if distance < np.radians(radius + SCA_RADIUS))
+        return {sca: footprint(header, self.shape) for sca, header in _headers(visit, near).items()} if near else {}
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact TAN-SIP header of an exposure."""
@@ -120,7 +133,7 @@ class Roman:
         """Return the PSF basis of an exposure, for stamps up to `size`: one PSF an SCA and band, as in the paper."""
         return _psf(exposure.detector, exposure.band, self.n_waves, size)
 
-    def background(self, exposure: Exposure, header: dict) -> np.ndarray:
+    def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current."""
         coord = galsim.CelestialCoord(header["CRVAL1"] * galsim.degrees, header["CRVAL2"] * galsim.degrees)
         level = galsim.roman.getSkyLevel(
@@ -128,7 +141,7 @@ class Roman:
         )
         level *= 1 + galsim.roman.stray_light_fraction
         flat = galsim.roman.thermal_backgrounds[exposure.band] + galsim.roman.dark_current
-        return (pixel_areas(header, self.shape) * level + flat * exposure.exptime).astype(np.float32)
+        return (pixel_areas(header, self.shape, rows, columns) * level + flat * exposure.exptime).astype(np.float32)
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
         """Return the noise of an empty pixel, electrons rms."""
@@ -179,6 +192,23 @@ def best_roll(ra: float, dec: float, mjd: float) -> float | None:
     return float((np.degrees(np.arctan2(east, north)) + theta_fpa / galsim.degrees) % 360)
 
 
+@lru_cache(maxsize=1)
+def _sca_offsets() -> np.ndarray:
+    """Return the centres (18, 2) of the SCAs on the focal plane, degrees along its own axes (x runs west at pa 0)."""
+    # any allowed pointing will do: the focal plane is rigid
+    headers = _headers(Exposure(0, 0, "H158", 61541.0, EXPTIME, 53.0, -40.0, 0.0), SCAS)
+    west, north = [], []
+    for header in headers.values():
+        vector = unit_vectors(header["CRVAL1"], header["CRVAL2"])
+        centre = unit_vectors(53.0, -40.0)
+        a, d = np.radians(53.0), np.radians(-40.0)
+        east_axis = np.array([-np.sin(a), np.cos(a), 0.0])
+        north_axis = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+        west.append(-np.degrees(vector @ east_axis / (vector @ centre)))
+        north.append(np.degrees(vector @ north_axis / (vector @ centre)))
+    return np.stack([west, north], axis=1)
+
+
 def _headers(visit: Exposure, scas: tuple[int, ...]) -> dict[int, dict]:
     """Return the headers of some SCAs of a visit; its pa is that of the focal plane's centre."""
     target = galsim.CelestialCoord(visit.ra * galsim.degrees, visit.dec * galsim.degrees)
@@ -199,7 +229,7 @@ def _header(wcs: galsim.BaseWCS) -> dict:
     return {key: full[key] for key in full.keys() if key.startswith(wanted)} | {"RADESYS": "ICRS"}  # noqa: SIM118
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def _psf(sca: int, band: str, n_waves: int, size: int) -> PsfBasis:
     nodes = roman_bandpass(band, n_waves).nodes
     profiles = [galsim.roman.getPSF(sca, band, pupil_bin=8, wavelength=wave) for wave in nodes]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from romandask.instruments.exposure import Exposure, pixel_areas
+from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.kernels.bandpasses import rubin_bandpass
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import PsfBasis, radial_basis
@@ -62,6 +62,7 @@ class Rubin:
     coadd_scale: float = SCALE
     pixel_scale: float = SCALE
     shape: tuple[int, int] = (4000, 4072)
+    field_radius: float = 1.9
     knot_smoothing: float = 0.0
     detection: Literal["median", "mean"] = "mean"
     detection_bands: tuple[str, ...] | None = None
@@ -115,8 +116,8 @@ class Rubin:
         visits = pd.concat(rows).sort_values(["mjd", "band"], ignore_index=True)
         return visits.assign(visit=np.arange(len(visits)))
 
-    def footprints(self, visit: Exposure) -> dict[int, np.ndarray]:
-        """Return the corners of the 189 detectors of a visit."""
+    def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
+        """Return the corners of the 189 detectors of a visit, wherever the cone is: all at once they cost nothing."""
         half = np.array(self.shape[::-1]) * SCALE / 2
         x, y = (_CENTRES[:, None, :] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).transpose(2, 0, 1) / 3600
         angle = np.radians(visit.pa)
@@ -145,10 +146,10 @@ class Rubin:
             transfers.append(share @ kolmogorov_transfer(frequency[None], fwhm[:, None], SYSTEM_FWHM * thickness[:, None]))
         return radial_basis(frequency, np.array(transfers), SCALE, size)
 
-    def background(self, exposure: Exposure, header: dict) -> np.ndarray:
+    def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of sky and dark current."""
         sky = self.bandpass(exposure.band).ab_photons() * 10 ** (-0.4 * exposure.sky_brightness)
-        return ((pixel_areas(header, self.shape) * sky + DARK) * exposure.exptime).astype(np.float32)
+        return ((pixel_areas(header, self.shape, rows, columns) * sky + DARK) * exposure.exptime).astype(np.float32)
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray | float) -> float:
         """Return the noise of an empty pixel, electrons rms."""

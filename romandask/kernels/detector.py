@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,8 +52,26 @@ def observe(
     return image, dq
 
 
-def noise_realisation(background: np.ndarray, detector: Detector, rng: np.random.Generator) -> np.ndarray:
-    """Return an image (float32, electrons) of the noise of an empty field: zero mean, background plus read noise."""
-    variance = np.asarray(background, np.float32) + np.float32(detector.read_noise**2)
-    noise = rng.standard_normal(variance.shape, dtype=np.float32)
-    return np.multiply(noise, np.sqrt(variance), out=noise)
+NOISE_ROWS = 256
+"""Rows whose noise realisation shares one generator: parts of an image need not draw the whole."""
+
+
+def noise_realisation(
+    background: np.ndarray, detector: Detector, width: int, rows: slice, columns: slice, generator: Callable[[int], np.random.Generator]
+) -> np.ndarray:
+    """Return the noise (float32, electrons) of an empty field: zero mean, the variance of background and read noise.
+
+    Parameters
+    ----------
+    background : (ny, nx) expected electrons of the rows and columns wanted
+    width : columns of the whole detector
+    generator : the random generator of a block of rows, by its number
+
+    The values of a pixel do not depend on which part of the detector is asked for.
+    """
+    noise = np.empty(background.shape, np.float32)
+    for block in range(rows.start // NOISE_ROWS, -(-rows.stop // NOISE_ROWS)):
+        first, last = max(rows.start, block * NOISE_ROWS), min(rows.stop, (block + 1) * NOISE_ROWS)
+        drawn = generator(block).standard_normal((NOISE_ROWS, width), dtype=np.float32)
+        noise[first - rows.start : last - rows.start] = drawn[first - block * NOISE_ROWS : last - block * NOISE_ROWS, columns]
+    return noise * np.sqrt(background + np.float32(detector.read_noise**2))

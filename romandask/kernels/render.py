@@ -99,9 +99,9 @@ def stamp_sizes(scene: Scene, basis: PsfBasis, faintest: float) -> np.ndarray:
 def largest_stamp(flux: float, radius: float, faintest: float, limit: int) -> int:
     """Return the stamp size that the brightest object of a scene may need, before the PSF has been sampled.
 
-    The wings of a diffraction-limited PSF fall as flux / r^3 with a factor below one in pixels.
+    The spikes of Roman's PSF, its brightest part far out, are 0.04 flux / r^2 a pixel; a seeing-limited PSF is fainter.
     """
-    reach = max((flux / max(faintest, 1e-12)) ** (1 / 3), radius + 6, 16.0)
+    reach = max((0.04 * flux / max(faintest, 1e-12)) ** 0.5, radius + 6, 16.0)
     return int(min(limit, 1 << int(np.ceil(np.log2(2 * reach)))))
 
 

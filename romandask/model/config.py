@@ -70,7 +70,7 @@ class RenderSettings(Section):
 
     n_waves: int = Field(5, ge=2, le=20, description="PSFs across a band between which the PSF is interpolated")
     truncation: float = Field(
-        0.02, gt=0, description="surface brightness at a stamp's edge, in units of the sky noise of a pixel"
+        0.04, gt=0, description="surface brightness at a stamp's edge, in units of the sky noise of a pixel"
     )
     largest: int = Field(1024, ge=64, description="largest stamp, pixels a side (a power of two)")
 

@@ -5,6 +5,7 @@ Roman's are drizzled from its exposures, one at a time; Rubin's are drawn direct
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from astropy.wcs import WCS
 from romandask.exposures import RenderExposure, cone, header_text, scene_stamp
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.detector import NO_DATA, SATURATED, noise_realisation
-from romandask.kernels.drizzle import Sums, cut, pixel_map
+from romandask.kernels.drizzle import Strip, Sums, pixel_map, strips
 from romandask.kernels.psf import PsfBasis
 from romandask.kernels.render import POINT, Scene, draw
 from romandask.kernels.scene import build_scene
@@ -87,7 +88,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         (len(tiles), len(instrument.bands)),
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        bytes_per_unit=pixels**2 * (40 if drawn else 26) + int(np.prod(instrument.shape)) * (0 if drawn else 20) + (300 << 20),
+        bytes_per_unit=pixels**2 * (48 if drawn else 33) + int(np.prod(instrument.shape)) * (0 if drawn else 22) + (250 << 20),
     )
 
 
@@ -116,7 +117,6 @@ class DrizzleTile:
         tile, band = self.tiles[k], instrument.bands[b]
         scale = instrument.coadd_scale
         target = WCS(tile.header(self.pixels, scale))
-        to_njy = NJY_ZERO_POINT / instrument.bandpass(band).ab_photons()
         side = psf_side(instrument)
         sums = Sums((self.pixels, self.pixels), 2, self.settings.pixfrac)
         psf = Sums((side, side), 1, self.settings.pixfrac)
@@ -124,22 +124,11 @@ class DrizzleTile:
             exposure = exposure_of(source.table.iloc[i])
             header = instrument.header(exposure)
             wcs = WCS(header)
-            part = cut(wcs, instrument.shape, target, (self.pixels, self.pixels))
-            if part is None:
-                continue
-            here = (part.rows, part.columns)
-            arrays = self.exposures.load(int(i), ("image", "dq"))
-            good = arrays["dq"] & (SATURATED | NO_DATA) == 0
-            light = subtract_background(arrays["image"], ~good)[here]
-            per_area = (to_njy / exposure.exptime) / pixel_areas(header, instrument.shape, *here)
-            identity = ("noise", instrument.name, exposure.visit, exposure.detector)
-            noise = noise_realisation(
-                instrument.background(exposure, header, *here), instrument.detector, instrument.shape[1], *here,
-                lambda block, identity=identity: rng(source.seed, "coadds", *identity, block),
-            )  # fmt: skip
-            weight = np.float32(exposure.exptime) * good[here]
-            sums.add([light * per_area, noise * per_area], weight, part.pixmap)
-            _add_star(psf, instrument, exposure, wcs, tile, side)
+            parts = strips(wcs, instrument.shape, target, (self.pixels, self.pixels))
+            if parts:
+                arrays = self.exposures.load(int(i), ("image", "dq"))
+                sums.add(_planes_of(arrays, parts, instrument, exposure, header, target, source.seed))
+                _add_star(psf, instrument, exposure, wcs, tile, side)
         area = np.float32(scale**2)
         return {
             "image": sums.image(0) * area,
@@ -200,6 +189,26 @@ class DrawTile:
         }
 
 
+def _planes_of(
+    arrays: dict[str, np.ndarray], parts: list[Strip], instrument: Instrument, exposure: Exposure, header: dict, target: WCS, seed: int
+) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
+    """Yield, for each strip, image and noise realisation in nJy/arcsec2, weight and map onto the tile."""
+    good = arrays["dq"] & (SATURATED | NO_DATA) == 0
+    light = subtract_background(arrays["image"], ~good)
+    to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
+    identity = ("noise", instrument.name, exposure.visit, exposure.detector)
+    wcs = WCS(header)
+    for part in parts:
+        here = (part.rows, part.columns)
+        scale = to_njy / pixel_areas(header, instrument.shape, *here)
+        noise = noise_realisation(
+            instrument.background(exposure, header, *here), instrument.detector, instrument.shape[1], *here,
+            lambda block: rng(seed, "coadds", *identity, block),
+        )  # fmt: skip
+        weight = np.float32(exposure.exptime) * good[here]
+        yield [light[here] * scale, noise * scale], weight, pixel_map(wcs, target, *here)
+
+
 def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return an exposure (float32, electrons) less its background, estimated from the image itself on a coarse mesh."""
     light = image.astype(np.float32)
@@ -241,7 +250,7 @@ def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, t
     rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
     area = pixel_areas_at(wcs, x, y)
     weight = np.full(star.shape, exposure.exptime, np.float32)
-    psf.add([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))
+    psf.add([([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))])
 
 
 def pixel_areas_at(wcs: WCS, x: float, y: float) -> float:

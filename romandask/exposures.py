@@ -9,7 +9,7 @@ import pandas as pd
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from romandask.instruments.exposure import Exposure, Instrument, exposure_of
+from romandask.instruments.exposure import Instrument, exposure_of
 from romandask.kernels.detector import DQ_FLAGS, observe
 from romandask.kernels.render import Scene, component_reach, draw, largest_stamp
 from romandask.kernels.scene import build_scene
@@ -18,7 +18,7 @@ from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
 from romandask.runtime.products import ImageProduct, Unit
-from romandask.runtime.store import Store, Variable
+from romandask.runtime.store import Variable
 from romandask.truth import TruthCatalogs
 
 REACH = 30.0
@@ -92,8 +92,8 @@ def exposures(
         (len(table),),
         coordinates,
         {"survey": instrument.name},
-        # image, truth, dq, background and their working copies, and the objects of one detector
-        bytes_per_unit=ny * nx * 25 + (300 << 20),
+        # image, truth, dq, background and working copies; two PSF bases, the last and the new; the objects
+        bytes_per_unit=ny * nx * 28 + 2 * render.n_waves * 36 * render.largest**2 + (150 << 20),
     )
 
 
@@ -121,13 +121,3 @@ def header_text(header: dict) -> str:
 def wcs_of(text: str) -> WCS:
     """Return the WCS of a header text."""
     return WCS(fits.Header.fromstring(text))
-
-
-def exposure_at(table: pd.DataFrame, index: int) -> Exposure:
-    """Return the exposure at a row of a pointings table."""
-    return exposure_of(table.iloc[index])
-
-
-def stored_exposures(product: ImageProduct, store: Store) -> ImageProduct:
-    """Return exposures that read what the store has and render the rest."""
-    return product.stored(store)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from coord.util import sun_position_ecliptic
 from galsim.roman.roman_wcs import theta_fpa
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, footprint, pixel_areas
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
@@ -58,6 +58,13 @@ class RomanSettings(Section):
     bands: tuple[Literal["Y106", "J129", "H158", "F184"], ...] = ("Y106", "J129", "H158", "F184")
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple"] = "simple"
+
+    @model_validator(mode="after")
+    def _every_band_dithered(self) -> RomanSettings:
+        missing = [band for band in self.bands if band not in self.pointings.dithers]
+        if missing and self.pointings.source == "plan":
+            raise ValueError(f"pointings.dithers has no entry for {', '.join(missing)}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,7 @@ class Roman:
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
         """Return the noise of an empty pixel, electrons rms."""
-        return float(np.sqrt(np.median(background) + self.detector.read_noise**2))
+        return float(np.sqrt(np.mean(background) + self.detector.read_noise**2))
 
 
 def first_observable(ra: float, dec: float, start: float) -> float:
@@ -229,7 +236,7 @@ def _header(wcs: galsim.BaseWCS) -> dict:
     return {key: full[key] for key in full.keys() if key.startswith(wanted)} | {"RADESYS": "ICRS"}  # noqa: SIM118
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
 def _psf(sca: int, band: str, n_waves: int, size: int) -> PsfBasis:
     nodes = roman_bandpass(band, n_waves).nodes
     profiles = [galsim.roman.getPSF(sca, band, pupil_bin=8, wavelength=wave) for wave in nodes]

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.kernels.bandpasses import rubin_bandpass
@@ -50,6 +50,13 @@ class RubinSettings(Section):
     bands: tuple[Literal["u", "g", "r", "i", "z", "y"], ...] = ("u", "g", "r", "i", "z", "y")
     mode: Literal["coadd"] = "coadd"
     pointings: RubinPointings = RubinPointings()
+
+    @model_validator(mode="after")
+    def _every_band_visited(self) -> RubinSettings:
+        missing = [band for band in self.bands if band not in self.pointings.visits]
+        if missing and self.pointings.source == "cadence":
+            raise ValueError(f"pointings.visits has no entry for {', '.join(missing)}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -153,7 +160,7 @@ class Rubin:
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray | float) -> float:
         """Return the noise of an empty pixel, electrons rms."""
-        return float(np.sqrt(np.median(background) + self.detector.read_noise**2))
+        return float(np.sqrt(np.mean(background) + self.detector.read_noise**2))
 
     def pixel_noise(self, exposure: Exposure) -> float:
         """Return the noise of an empty pixel, electrons rms, without making the image of the background."""

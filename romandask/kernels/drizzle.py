@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,25 +12,24 @@ from scipy.interpolate import RectBivariateSpline
 
 GRID = 64
 """Pixels between the points at which the map between two WCSs is computed exactly."""
+STRIP = 512
+"""Rows of a strip."""
 MARGIN = 4
 """Pixels around the part of an exposure that falls on a tile."""
 
 
 @dataclass(frozen=True)
-class Cutout:
-    """The part of an exposure that falls on a tile, and where each of its pixels falls."""
+class Strip:
+    """Some rows of the part of an exposure that falls on a tile."""
 
     rows: slice
     columns: slice
-    pixmap: np.ndarray
-    """(ny, nx, 2) x and y on the tile, 0 at the first pixel's centre."""
 
 
-def cut(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple[int, int]) -> Cutout | None:
-    """Return the part of a source image that falls on a target image; None where they do not touch.
+def strips(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple[int, int]) -> list[Strip]:
+    """Return the part of a source image that may fall on a target image, in strips of rows; empty where none does.
 
-    The map is computed through both WCSs on a grid of every 64th pixel and interpolated by cubic splines: for Roman's
-    fourth-order distortion the largest error over an SCA is below 1e-5 tile pixels.
+    Strips bound the memory of the map between the two images, 16 bytes a pixel.
     """
     ys, xs = (np.unique(np.r_[np.arange(0, n - 1, GRID), n - 1]) for n in shape)
     x, y = _through(source, target, *np.meshgrid(xs, ys))
@@ -40,15 +40,20 @@ def cut(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple[in
     back = _through(target, source, *(axis.ravel() for axis in np.meshgrid(edge * nx, edge * ny)))
     inside = (back[0] > -0.5) & (back[0] < shape[1] - 0.5) & (back[1] > -0.5) & (back[1] < shape[0] - 0.5)
     if not on.any() and not inside.any():
-        return None
+        return []
     u = np.concatenate([np.broadcast_to(xs, on.shape)[on], back[0][inside]])
     v = np.concatenate([np.broadcast_to(ys[:, None], on.shape)[on], back[1][inside]])
     columns, rows = _bounds(u, shape[1]), _bounds(v, shape[0])
-    return Cutout(rows, columns, pixel_map(source, target, rows, columns))
+    starts = range(rows.start, rows.stop, STRIP)
+    return [Strip(slice(start, min(start + STRIP, rows.stop)), columns) for start in starts]
 
 
 def pixel_map(source: WCS, target: WCS, rows: slice, columns: slice) -> np.ndarray:
-    """Return where the pixels of a part of the source fall on the target, (ny, nx, 2)."""
+    """Return where the pixels of a part of the source fall on the target, (ny, nx, 2), 0 at the first pixel's centre.
+
+    The map is computed through both WCSs on a grid of every 64th pixel and interpolated by cubic splines: for Roman's
+    fourth-order distortion the largest error over an SCA is below 1e-5 tile pixels.
+    """
     ys, xs = (_knots(part) for part in (rows, columns))
     x, y = _through(source, target, *np.meshgrid(xs, ys))
     pixmap = np.empty((rows.stop - rows.start, columns.stop - columns.start, 2))
@@ -68,21 +73,15 @@ class Sums:
         self.count = np.zeros(shape, np.uint8)
         """Number of exposures that contribute to each pixel."""
 
-    def add(self, images: list[np.ndarray], weight: np.ndarray, pixmap: np.ndarray) -> None:
-        """Add the planes of one exposure: images in surface brightness, weight 0 where a pixel is bad."""
-        box = self._reach(pixmap)
-        before = self.weight[box].copy()
-        for drizzle, image in zip(self._drizzles, images, strict=True):
-            drizzle.add_image(
-                image, exptime=1.0, pixmap=pixmap, weight_map=weight, pixfrac=self._pixfrac, in_units="cps"
-            )
-        self.count[box] += self.weight[box] > before
-
-    def _reach(self, pixmap: np.ndarray) -> tuple[slice, slice]:
-        ny, nx = self.count.shape
-        (low_x, low_y), (high_x, high_y) = pixmap.min(axis=(0, 1)) - MARGIN, pixmap.max(axis=(0, 1)) + MARGIN
-        x, y = np.clip([low_x, high_x], 0, nx).astype(int), np.clip([low_y, high_y], 0, ny).astype(int)
-        return slice(y[0], y[1] + 1), slice(x[0], x[1] + 1)
+    def add(self, parts: Iterable[tuple[list[np.ndarray], np.ndarray, np.ndarray]]) -> None:
+        """Add one exposure in strips of (images in surface brightness, weight, map); weight 0 where a pixel is bad."""
+        before = self.weight.copy()
+        for images, weight, pixmap in parts:
+            for drizzle, image in zip(self._drizzles, images, strict=True):
+                drizzle.add_image(
+                    image, exptime=1.0, pixmap=pixmap, weight_map=weight, pixfrac=self._pixfrac, in_units="cps"
+                )
+        self.count += self.weight > before
 
     @property
     def weight(self) -> np.ndarray:

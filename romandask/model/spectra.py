@@ -114,10 +114,12 @@ def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]],
     """
     rows = np.empty((len(names), len(grid)))
     for row, name, (wave, flambda) in zip(rows, names, spectra, strict=True):
-        at_500 = np.interp(MAGNORM_WAVE, wave, flambda)
+        # between samples the photon density is linear, as GalSim has it; templates are coarse enough for it to matter
+        photons = np.asarray(flambda) * wave
+        at_500 = np.interp(MAGNORM_WAVE, wave, photons)
         if not at_500 > 0:
             raise ValueError(f"spectrum {name} has no light at 500 nm, where magnorm is defined")
-        row[:] = np.interp(grid, wave, flambda, left=0.0, right=0.0) * grid / (at_500 * MAGNORM_WAVE)
+        row[:] = np.interp(grid, wave, photons, left=0.0, right=0.0) / at_500
     return SpectrumLibrary(tuple(names), grid, rows)
 
 

@@ -90,7 +90,7 @@ class TileGrid:
         """Return a tile by its id."""
         ring, column = divmod(int(tile_id), _RING)
         dec = -90 + (2 * ring + 1) * self.inner / 7200
-        ra = float((column + 0.5) * self._width(ring))
+        ra = float((column + 0.5) * self._width(ring)) % 360
         return Tile(id=int(tile_id), name=f"{ra:.4f}_{dec:+.4f}", ra=ra, dec=dec)
 
     def covering(self, region: Region) -> list[Tile]:
@@ -108,11 +108,12 @@ class TileGrid:
         for ring in range(max(first, 0), last):
             self._check_ring(ring)
             width, columns = self._width(ring), int(self._columns(ring))
-            low = region.ra_min % 360
-            lowest = int(np.floor(low / width + 1e-9))
-            highest = int(np.ceil((low + region.width) / width - 1e-9))
-            wrapped = {column % columns if column >= columns else column for column in range(lowest, highest)}
-            tiles += [self.tile(ring * _RING + column) for column in sorted(wrapped)]
+            # columns count from RA 0 and the last may be cut short there: a region across it is two
+            found: set[int] = set()
+            for low, high in _without_wrap(region):
+                lowest, highest = int(np.floor(low / width + 1e-9)), int(np.ceil(high / width - 1e-9))
+                found |= set(range(lowest, min(highest, columns)))
+            tiles += [self.tile(ring * _RING + column) for column in sorted(found)]
         return tiles
 
     @property
@@ -139,3 +140,10 @@ class TileGrid:
                 f"wide need an overlap of {excess + bend:.1f} arcsec there, coadds.overlap gives "
                 f"{self.overlap:.1f}: raise coadds.overlap or lower coadds.pixels"
             )
+
+
+def _without_wrap(region: Region) -> list[tuple[float, float]]:
+    """Return the ranges of right ascension of a region, none across 360."""
+    low = region.ra_min % 360
+    high = low + region.width
+    return [(low, high)] if high <= 360 else [(low, 360.0), (0.0, high - 360)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import socket
 import traceback
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -71,8 +72,11 @@ class OnCluster:
         """Yield what became of each unit; one that fails is tried up to three times."""
         waiting = sorted(tasks, key=lambda task: (-task.cost, task.index))[::-1]
         tries = {task.index: 0 for task in tasks}
-        # the product goes to every worker once; a task carries only its number and its hash
-        shared = self._client.scatter(product, broadcast=True, hash=False)
+        # the product goes to every worker once; a task carries only its number and its hash. It is the result of a
+        # task, not scattered data: when the workers that hold it die the scheduler can make it again
+        name = product.stage.replace("/", "-")
+        token = uuid.uuid4().hex[:8]
+        shared = self._client.submit(_itself, product, key=f"{name}-product-{token}")
         futures: dict[Any, Task] = {}
         flow = as_completed([], with_results=False)
 
@@ -81,8 +85,7 @@ class OnCluster:
             while waiting and len(futures) < room:
                 task = waiting.pop()
                 tries[task.index] += 1
-                name = product.stage.replace("/", "-")
-                key = f"{name}-{product.units[task.index].name}-{product.units[task.index].name}.{tries[task.index]}"
+                key = f"{name}-{product.units[task.index].name}-{token}-{tries[task.index]}"
                 future = self._client.submit(make_unit, shared, task, store, key=key, pure=False)
                 futures[future] = task
                 flow.add(future)
@@ -107,7 +110,13 @@ class OnCluster:
                 self._client.cancel(list(futures), force=True)
 
 
+def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:
+    return product
+
+
 def _failure(future: Any) -> str:
+    if future.status != "error":
+        return f"the task was {future.status}: its worker died, perhaps for want of memory\n"
     error = future.exception()
     lines = traceback.format_exception(type(error), error, future.traceback())
     return "".join(lines)

@@ -1,0 +1,86 @@
+"""Fixtures: the shared real data, a small Roman whose detectors are quick to draw, and one stored tiny survey."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from romandask.exposures import exposures
+from romandask.instruments.exposure import Exposure, footprint
+from romandask.instruments.roman import Roman, RomanSettings
+from romandask.instruments.rubin import Rubin, RubinSettings
+from romandask.model.config import CoaddSettings, RenderSettings, TruthSettings
+from romandask.model.sky import Region
+from romandask.pointings import CORNERS
+from romandask.truth import truth
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder of real inputs from the field."""
+    if not SHARED.is_dir():
+        pytest.skip("the shared real inputs (../shared/data) are not beside this checkout")
+    return SHARED
+
+
+def command(*arguments: str, cwd: Path | None = None, timeout: float = 600) -> subprocess.CompletedProcess:
+    """Run the command line as a user would."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONWARNINGS"}
+    return subprocess.run(
+        [sys.executable, "-m", "romandask.cli", *arguments],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False,
+    )  # fmt: skip
+
+
+MINI = (
+    "roman.bands=[H158]", "rubin.bands=[i]", "roman.pointings.dithers={H158: [2]}", "rubin.pointings.visits={i: 8}",
+    "coadds.pixels=600", "coadds.overlap=60", "region.ra=[53.0151, 53.024]", "region.dec=[-40.008, -40.0006]",
+    "truth.galaxies=150", "render.n_waves=3",
+)  # fmt: skip
+"""Overrides that make the tiny pipeline a few seconds long."""
+
+
+@pytest.fixture(scope="session")
+def tiny_store(tmp_path_factory) -> Path:
+    """The tiny pipeline, run once by the command line from an empty folder."""
+    folder = tmp_path_factory.mktemp("tiny")
+    done = command("run", "tiny", "--store", "tiny", cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "tiny"
+
+
+class SmallSurvey:
+    """Three overlapping Roman exposures with detectors of 300 pixels, the truth under them, and tiles."""
+
+    def __init__(self):
+        settings = RomanSettings(bands=("H158",))
+        self.roman = replace(Roman(settings, n_waves=3), shape=(300, 300))
+        base = Exposure(0, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)
+        # the detector of interest lies off the boresight: shift the boresights by half a detector
+        self.exposures = [replace(base, visit=k, dec=-40.0 + k * 14 / 3600, mjd=61541.0 + k) for k in range(3)]
+        corners = np.stack([footprint(self.roman.header(e), self.roman.shape) for e in self.exposures])
+        rows = [vars(e) | dict(zip(CORNERS, c.ravel(), strict=True)) for e, c in zip(self.exposures, corners, strict=True)]
+        self.table = pd.DataFrame(rows)
+        ra, dec = corners[..., 0], corners[..., 1]
+        self.region = Region(ra.min(), ra.max(), dec.min(), dec.max())
+        rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
+        bandpasses = {"H158": self.roman.bandpass("H158"), "i": rubin.bandpass("i")}
+        self.truth = truth(TruthSettings(order=11, margin=5.0), Path("."), self.region, bandpasses, 5)
+        self.product = exposures(self.table, self.truth, self.roman, RenderSettings(n_waves=3), 5)
+        self.settings = CoaddSettings(pixels=260, overlap=30)
+        self.tiles = self.settings.grid().covering(self.region)
+
+
+@pytest.fixture(scope="session")
+def small() -> SmallSurvey:
+    return SmallSurvey()

@@ -30,6 +30,8 @@ from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.products import ImageProduct, TableProduct, Unit
 from romandask.runtime.schemas import schema
 
+VISIT = 30.0
+"""Seconds of a visit, where a coadd's weight is not its exposure time."""
 EXTENDED = 1.15
 """Half-light radius over the PSF's above which an object counts as extended."""
 
@@ -122,11 +124,9 @@ class DetectTile:
 def load_layer(coadds: ImageProduct, instrument: Instrument, tile: int, position: int, band: str) -> Layer:
     """Return one band of a tile for photometry."""
     arrays = coadds.load(tile * len(instrument.bands) + position)
-    seconds = arrays["weight"] if instrument.coadd_from == "exposures" else arrays["nimages"] * np.float32(30.0)
-    rate = instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT
-    return Layer(
-        arrays["image"], arrays["noise"], arrays["weight"], np.maximum(seconds * np.float32(rate), 1e-6), arrays["psf"]
-    )
+    seconds, per_unit = (arrays["weight"], 1.0) if instrument.coadd_from == "exposures" else (arrays["nimages"], VISIT)
+    rate = instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT * per_unit
+    return Layer(arrays["image"], arrays["noise"], arrays["weight"], seconds, rate, arrays["psf"])
 
 
 def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: Region) -> np.ndarray:

@@ -23,6 +23,8 @@ from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.products import TableProduct, Unit
 from romandask.runtime.schemas import schema
 
+WIDE = 1e7
+"""Square arcminutes above which the cells of a region are not listed one by one."""
 _NO_BINS = np.zeros(0, np.float32)
 
 
@@ -92,15 +94,15 @@ def truth(
         rows = 0
     else:
         source = skycatalogs.open_source(data / str(settings.path))
-        parents = sorted(set((region.cells(skycatalogs.ORDER, settings.margin)).tolist()))
-        parents = [cell for cell in parents if cell in source.galaxies or cell in source.stars]
+        near = skycatalogs.around(region.cells(skycatalogs.ORDER, settings.margin).tolist())
+        parents = [cell for cell in near if cell in source.galaxies or cell in source.stars]
         names = skycatalogs.sed_names(source, parents)
         library, unusable = spectra_files.read_folder(data / (settings.seds or "seds"), names)
         depth = 2 * (settings.order - skycatalogs.ORDER)
-        inside = region.cells(settings.order, settings.margin) if region.area < 1e7 else None
-        children = [np.arange(cell << depth, (cell + 1) << depth) for cell in parents]
+        children = [np.arange(cell << depth, (cell + 1) << depth) for cell in skycatalogs.around(parents)]
         cells = np.concatenate(children) if children else np.empty(0, np.int64)
-        cells = cells if inside is None else np.intersect1d(cells, inside)
+        if region.area < WIDE:
+            cells = np.intersect1d(cells, region.cells(settings.order, settings.margin))
         options = (settings, region, bandpasses, source, library, unusable, cells)
         makers = {
             "galaxies": _ReadGalaxies(*options), "stars": _ReadStars(*options), "quarantine": _ReadBad(source, unusable, tuple(parents))
@@ -224,15 +226,20 @@ class _Read:
         mine = (located["_healpix_29"].to_numpy() >> depth) == int(self.cells[index])
         return located[mine].reset_index(drop=True)
 
-    def _parent(self, index: int) -> int:
-        return int(self.cells[index]) >> (2 * (self.settings.order - skycatalogs.ORDER))
+    def _files(self, index: int, files: dict[int, Path]) -> list[int]:
+        """The files that may hold rows of the partition: its own and those around."""
+        own = int(self.cells[index]) >> (2 * (self.settings.order - skycatalogs.ORDER))
+        return [cell for cell in skycatalogs.around([own]) if cell in files]
 
 
 class _ReadGalaxies(_Read):
     def __call__(self, index: int) -> pd.DataFrame:
-        if self._parent(index) not in self.source.galaxies:
+        files = self._files(index, self.source.galaxies)
+        parts = [self._inside(skycatalogs.read_galaxies(self.source, cell), index) for cell in files]
+        parts = [part for part in parts if len(part)]
+        if not parts:
             return schema("galaxies", tuple(self.bandpasses)).empty_table().to_pandas()
-        frame = self._inside(skycatalogs.read_galaxies(self.source, self._parent(index)), index)
+        frame = pd.concat(parts, ignore_index=True)
         frame["n_knots"] = frame["n_knots"].fillna(0)
         # NaN means, as inf does, that the component has no light
         for component in COMPONENTS:
@@ -246,9 +253,12 @@ class _ReadGalaxies(_Read):
 
 class _ReadStars(_Read):
     def __call__(self, index: int) -> pd.DataFrame:
-        if self._parent(index) not in self.source.stars:
+        files = self._files(index, self.source.stars)
+        parts = [self._inside(skycatalogs.read_stars(self.source, cell, self.unusable), index) for cell in files]
+        parts = [part for part in parts if len(part)]
+        if not parts:
             return schema("stars", tuple(self.bandpasses)).empty_table().to_pandas()
-        frame = self._inside(skycatalogs.read_stars(self.source, self._parent(index), self.unusable), index)
+        frame = pd.concat(parts, ignore_index=True)
         place = {name: row for row, name in enumerate(self.library.names)}
         frame["sed"] = frame["sed_filepath"].map(place).astype(int)
         none = pd.DataFrame({f"{component}_sed": np.empty(0, int) for component in COMPONENTS})

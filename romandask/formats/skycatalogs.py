@@ -12,6 +12,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from cdshealpix import from_ring
+from cdshealpix.nested import neighbours
 
 from romandask.model.config import read_yaml
 from romandask.model.errors import UserError
@@ -120,6 +121,12 @@ def sed_names(source: Source, cells: list[int]) -> list[str]:
     return sorted(name for name in names if name)
 
 
+def around(cells: list[int]) -> list[int]:
+    """Return cells of order 5 with their neighbours, sorted: lensing moves some objects out of their file's pixel."""
+    found = neighbours(np.array(cells, np.uint64), ORDER) if cells else np.empty(0)
+    return sorted({int(cell) for cell in np.ravel(found) if cell >= 0})
+
+
 def count_rows(source: Source, cells: list[int]) -> int:
     """Return the rows of the files of some cells, from their footers."""
     paths = [files[cell] for files in (source.galaxies, source.stars) for cell in cells if cell in files]
@@ -158,6 +165,6 @@ def _check(path: Path, columns: tuple[str, ...]) -> None:
             raise UserError(f"{path}: column {name!r} is missing (found {', '.join(names)})")
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=20)
 def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     return pq.read_table(path, columns=list(columns)).to_pandas()

@@ -40,10 +40,18 @@ class Layer:
     """(ny, nx) a realisation of the noise of an empty field."""
     weight: np.ndarray
     """(ny, nx) proportional to the inverse variance of an empty pixel; 0 for no data."""
-    electrons: np.ndarray | float
-    """Electrons per unit flux, for the Poisson noise of the objects; inf for none."""
+    seconds: np.ndarray | None
+    """(ny, nx) total exposure time, for the Poisson noise of the objects; None for none."""
+    rate: float
+    """Electrons per second and unit flux."""
     psf: np.ndarray
     """(side, side) unit star."""
+
+    def poisson(self, flux: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the variance that the objects' own light adds to their fluxes."""
+        if self.seconds is None:
+            return np.zeros(len(x))
+        return np.maximum(np.nan_to_num(flux), 0) / np.maximum(_at(self.seconds, x, y) * self.rate, 1e-6)
 
     def error(self) -> np.ndarray:
         """Return the rms of a pixel (float32) from the noise realisation, varying as the weight; 0 for no data."""
@@ -77,7 +85,7 @@ def median_layer(layers: list[Layer]) -> Layer:
     """Return the NaN-aware median of bands: pixels without data in a band do not count."""
     image = _median([layer.image for layer in layers], [layer.weight for layer in layers])
     noise = _median([layer.noise for layer in layers], [layer.weight for layer in layers])
-    return Layer(image, noise, _mean_weight(layers), np.inf, _mean_psf(layers))
+    return Layer(image, noise, _mean_weight(layers), None, 0.0, _mean_psf(layers))
 
 
 def mean_layer(layers: list[Layer]) -> Layer:
@@ -92,7 +100,7 @@ def mean_layer(layers: list[Layer]) -> Layer:
         noise += weight * layer.noise
     good = total > 0
     safe = np.where(good, total, 1)
-    return Layer((image / safe).astype(np.float32), (noise / safe).astype(np.float32), total.astype(np.float32), np.inf, _mean_psf(layers))
+    return Layer((image / safe).astype(np.float32), (noise / safe).astype(np.float32), total.astype(np.float32), None, 0.0, _mean_psf(layers))
 
 
 def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast: float) -> Found:
@@ -156,9 +164,8 @@ def ellipse_flux(layer: Layer, error: np.ndarray, x, y, a, b, theta, r) -> tuple
     mask = layer.weight <= 0
     flux, white, flag = sep.sum_ellipse(layer.image, x, y, a, b, theta, r, err=error, mask=mask, subpix=5)
     ratio = np.interp(r * np.sqrt(a * b), _NOISE_RADII, noise_ratios(layer, error))
-    poisson = np.maximum(flux, 0) / _at(layer.electrons, x, y)
     empty = _at(layer.weight, x, y) <= 0
-    return flux, np.sqrt((white * ratio) ** 2 + poisson), flag | np.where(empty, NO_DATA, 0)
+    return flux, np.sqrt((white * ratio) ** 2 + layer.poisson(flux, x, y)), flag | np.where(empty, NO_DATA, 0)
 
 
 def noise_ratios(layer: Layer, error: np.ndarray) -> np.ndarray:
@@ -194,7 +201,7 @@ def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
     ratio = np.std(trial[good] * np.sqrt(trial_norm[good]) / pixel[good]) if good.sum() > 50 else 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         white = np.where(norm > 0, _at(error, found.x, found.y) / np.sqrt(norm), np.nan)
-    return flux, np.sqrt((white * ratio) ** 2 + np.maximum(np.nan_to_num(flux), 0) / _at(layer.electrons, found.x, found.y))
+    return flux, np.sqrt((white * ratio) ** 2 + layer.poisson(flux, found.x, found.y))
 
 
 def psf_half_light_radius(psf: np.ndarray) -> float:
@@ -237,22 +244,24 @@ def _psf_fit(image: np.ndarray, psf: np.ndarray, x: np.ndarray, y: np.ndarray) -
     return flux, norm
 
 
-def _at(plane: np.ndarray | float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    if np.ndim(plane) == 0:
-        return np.full(len(x), float(plane))
-    plane = np.asarray(plane)
+def _at(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     ix = np.clip(np.rint(x).astype(int), 0, plane.shape[1] - 1)
     iy = np.clip(np.rint(y).astype(int), 0, plane.shape[0] - 1)
     return plane[iy, ix]
 
 
 def _median(planes: list[np.ndarray], weights: list[np.ndarray]) -> np.ndarray:
-    if all((weight > 0).all() for weight in weights):
-        return np.median(planes, axis=0).astype(np.float32)
-    data = np.array([np.where(weight > 0, plane, np.nan) for plane, weight in zip(planes, weights, strict=True)])
-    covered = np.isfinite(data).any(axis=0)
-    data[:, ~covered] = 0
-    return np.nanmedian(data, axis=0).astype(np.float32)
+    """Return the median over bands, by blocks of rows; a band counts where it has weight, and 0 stands for no data."""
+    out = np.empty(planes[0].shape, np.float32)
+    for first in range(0, len(out), 256):
+        rows = slice(first, first + 256)
+        values = np.stack([np.where(w[rows] > 0, p[rows], np.inf) for p, w in zip(planes, weights, strict=True)])
+        values.sort(axis=0)
+        count = np.isfinite(values).sum(axis=0)
+        middle = [np.take_along_axis(values, np.maximum(k, 0)[None], axis=0)[0] for k in ((count - 1) // 2, count // 2)]
+        with np.errstate(invalid="ignore"):
+            out[rows] = np.where(count > 0, (middle[0] + middle[1]) / 2, 0)
+    return out
 
 
 def _mean_weight(layers: list[Layer]) -> np.ndarray:

@@ -45,5 +45,5 @@ def stack(polygons: np.ndarray, variances: np.ndarray, gains: np.ndarray, shape:
         weight += inside * np.float32(1 / variance)
         source += inside * np.float32(1 / (variance**2 * gain))
         shares[k] = inside.sum() / variance
-    covered = np.maximum(weight, np.finfo(np.float32).tiny)
-    return Stack(count, weight, np.where(weight > 0, source / covered**2, 0).astype(np.float32), shares)
+    safe = np.where(weight > 0, weight, 1)
+    return Stack(count, weight, source / safe**2, shares)

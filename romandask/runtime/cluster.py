@@ -6,7 +6,9 @@ The only module that knows distributed.
 from __future__ import annotations
 
 import os
+import queue
 import socket
+import time
 import traceback
 import uuid
 from collections.abc import Callable, Iterator
@@ -15,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import dask
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, LocalCluster
 
 from romandask.model.errors import UserError
 from romandask.runtime.manifest import Record
@@ -25,6 +27,8 @@ from romandask.runtime.work import Task, make_unit
 
 ATTEMPTS = 3
 """A unit that fails this often is set aside."""
+PATIENCE = 60.0
+"""Seconds that a run waits for a cluster without workers."""
 WAVE = 4
 """Units in flight a worker: enough to keep it busy, few enough that nothing piles up."""
 
@@ -78,7 +82,7 @@ class OnCluster:
         token = uuid.uuid4().hex[:8]
         shared = self._client.submit(_itself, product, key=f"{name}-product-{token}")
         futures: dict[Any, Task] = {}
-        flow = as_completed([], with_results=False)
+        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
         def submit() -> None:
             room = WAVE * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
@@ -88,12 +92,12 @@ class OnCluster:
                 key = f"{name}-{product.units[task.index].name}-{token}-{tries[task.index]}"
                 future = self._client.submit(make_unit, shared, task, store, key=key, pure=False)
                 futures[future] = task
-                flow.add(future)
+                future.add_done_callback(ended.put)
 
         try:
             submit()
             while futures:
-                future = next(flow)
+                future = self._next(ended)
                 task = futures.pop(future)
                 if future.status == "finished":
                     outcome = Outcome(task.index, future.result())
@@ -108,6 +112,24 @@ class OnCluster:
         finally:
             if futures:
                 self._client.cancel(list(futures), force=True)
+
+
+    def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
+        """Return the next task that ends; UserError where no worker is left for a minute to end one."""
+        alone_since: float | None = None
+        while True:
+            try:
+                return ended.get(timeout=2.0)
+            except queue.Empty:
+                if self._client.scheduler_info(n_workers=-1)["workers"]:
+                    alone_since = None
+                    continue
+                alone_since = alone_since or time.monotonic()
+                if time.monotonic() - alone_since > PATIENCE:
+                    raise UserError(
+                        f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
+                        "(memory: raise run.memory_limit); the same command resumes"
+                    ) from None
 
 
 def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:

@@ -30,11 +30,17 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help="A joint Roma
 ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
 app.add_typer(ingest_app, name="ingest")
 
-Source = Annotated[str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")]
-Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")]
+Source = Annotated[
+    str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
+]
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
+]
 Place = Annotated[Path, typer.Option("--store", help="Folder of the store.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
-Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
+]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Folder of the store.")]
 
 
@@ -52,7 +58,12 @@ def plan(
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
         table.add_row(row.stage, str(row.units), size, f"{row.memory / 2**30:.2f} GiB")
     total = sum(row.units for row in rows)
-    table.add_row("total", str(total), f"{sum(row.bytes for row in rows) / 1e9:.2f} GB", f"limit {settings.run.memory_limit:.2f} GiB")
+    table.add_row(
+        "total",
+        str(total),
+        f"{sum(row.bytes for row in rows) / 1e9:.2f} GB",
+        f"limit {settings.run.memory_limit:.2f} GiB",
+    )
     Console().print(table)
     if dag is not None:
         dag_svg(rows, dag)
@@ -60,7 +71,9 @@ def plan(
 
 
 @app.command()
-def run(pipeline: Source, store: Place, overrides: Overrides = None, workers: Workers = None, scheduler: Scheduler = None) -> None:
+def run(
+    pipeline: Source, store: Place, overrides: Overrides = None, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
     """Make and store everything that is missing, then the report. The same command resumes."""
     settings = load_pipeline(pipeline, overrides)
     reporter = Reporter(Console())
@@ -107,11 +120,13 @@ def report(store: StoreArgument) -> None:
 def skycatalogs(
     source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of skyCatalogs files.")],
     store: Place,
-    seds: Annotated[Path | None, typer.Option("--seds", help="Folder of the spectra that stars name; default: SRC/../seds.")] = None,
+    seds: Annotated[
+        Path | None, typer.Option("--seds", help="Folder of the spectra that stars name; default: SRC/../seds.")
+    ] = None,
     order: Annotated[int, typer.Option("--order", min=5, max=12, help="HEALPix order of the partitions.")] = 5,
     workers: Workers = 0,
 ) -> None:
-    """Partition skyCatalogs galaxies and stars into HATS catalogs, with fluxes in all ten bands; bad rows to quarantine."""
+    """Bring skyCatalogs in as HATS catalogs, with fluxes in all ten bands; bad rows go to quarantine."""
     content = {
         "name": "ingest",
         "seed": 0,

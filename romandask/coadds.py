@@ -52,9 +52,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
     footprints = np.stack([tile.corners(grid.side) for tile in tiles])
     e, t = touching_pairs(corners_of(table), footprints)
     bands = table["band"].to_numpy()
-    members = {
-        (k, band): e[(t == k) & (bands[e] == band)] for k in range(len(tiles)) for band in instrument.bands
-    }
+    members = {(k, band): e[(t == k) & (bands[e] == band)] for k in range(len(tiles)) for band in instrument.bands}
     maker = (DrawTile if drawn else DrizzleTile)(exposures, tuple(tiles), members, settings, pixels, render.render)
     units = []
     for k, tile in enumerate(tiles):
@@ -64,12 +62,17 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
                 "exposures": [exposures.units[i].name for i in members[k, band]],
             }  # fmt: skip
             if drawn:
-                state |= {"rows": [vars(exposure_of(table.iloc[i])) for i in members[k, band]], **render.render.model_dump()}
+                state |= {
+                    "rows": [vars(exposure_of(table.iloc[i])) for i in members[k, band]],
+                    **render.render.model_dump(),
+                }
                 ra, dec, radius = cone(footprints[k])
                 inputs = render.truth.inputs(ra, dec, radius)
             else:
                 inputs = tuple((exposures.stage, exposures.units[i].name) for i in members[k, band])
-            units.append(Unit(f"{tile.name}-{band}", {**state, "seed": render.seed}, inputs, 1.0 + len(members[k, band])))
+            units.append(
+                Unit(f"{tile.name}-{band}", {**state, "seed": render.seed}, inputs, 1.0 + len(members[k, band]))
+            )
     headers = [header_text(tile.header(pixels, instrument.coadd_scale)) for tile in tiles]
     coordinates = {
         "tile": (("tile",), np.array([tile.name for tile in tiles], object), {}),
@@ -88,7 +91,9 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         (len(tiles), len(instrument.bands)),
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        bytes_per_unit=pixels**2 * (48 if drawn else 33) + int(np.prod(instrument.shape)) * (0 if drawn else 22) + (250 << 20),
+        bytes_per_unit=pixels**2 * (48 if drawn else 33)
+        + int(np.prod(instrument.shape)) * (0 if drawn else 22)
+        + (250 << 20),
     )
 
 
@@ -141,7 +146,7 @@ class DrizzleTile:
 
 @dataclass(frozen=True)
 class DrawTile:
-    """Makes one tile and band directly from the cadence: the expectation with the effective PSF, and the stack's noise."""
+    """Makes one tile and band from the cadence: the expectation with the effective PSF, and the stack's noise."""
 
     exposures: ImageProduct
     tiles: tuple[Tile, ...]
@@ -169,7 +174,13 @@ class DrawTile:
         if not layers.shares.any():
             side = psf_side(instrument)
             blank = np.zeros(shape, np.float32)
-            return {"image": blank, "weight": blank, "noise": blank, "nimages": layers.count, "psf": np.zeros((side, side))}
+            return {
+                "image": blank,
+                "weight": blank,
+                "noise": blank,
+                "nimages": layers.count,
+                "psf": np.zeros((side, side)),
+            }
         ra, dec, radius = cone(tile.corners(self.settings.grid().side))
         scene = build_scene(source.truth.near(ra, dec, radius), wcs, bandpass, to_njy, instrument.knot_smoothing)
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
@@ -179,7 +190,9 @@ class DrawTile:
         expected = np.where(covered, draw(scene, basis, shape, faintest), 0)
         empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
         light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
-        other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band).standard_normal(
+            shape, dtype=np.float32
+        )
         return {
             "image": expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0)),
             "weight": layers.weight,
@@ -190,7 +203,13 @@ class DrawTile:
 
 
 def _planes_of(
-    arrays: dict[str, np.ndarray], parts: list[Strip], instrument: Instrument, exposure: Exposure, header: dict, target: WCS, seed: int
+    arrays: dict[str, np.ndarray],
+    parts: list[Strip],
+    instrument: Instrument,
+    exposure: Exposure,
+    header: dict,
+    target: WCS,
+    seed: int,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
     """Yield, for each strip, image and noise realisation in nJy/arcsec2, weight and map onto the tile."""
     good = arrays["dq"] & (SATURATED | NO_DATA) == 0
@@ -237,7 +256,7 @@ def _star(basis: PsfBasis, bandpass: Bandpass, side: int, offset: tuple[float, f
 
 
 def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, tile: Tile, side: int) -> None:
-    """Drizzle a unit star, drawn as the exposure sees it as near as possible to the tile's centre, onto the PSF image."""
+    """Drizzle a unit star, as the exposure sees it as near as it can to the tile's centre, onto the PSF image."""
     ny, nx = instrument.shape
     at = np.array(wcs.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float)
     # a stamp at any roll covers the corners of the PSF image
@@ -266,9 +285,13 @@ def _planes(pixels: int, psf: int, weight_unit: str) -> tuple[Variable, ...]:
     return (
         Variable("image", "float32", shape, axes, {"units": "nJy", "long_name": "flux of a pixel"}),
         Variable("weight", "float32", shape, axes, {"units": weight_unit, "long_name": "sum of weights"}),
-        Variable("noise", "float32", shape, axes, {"units": "nJy", "long_name": "noise realisation with the image's correlations"}),
+        Variable(
+            "noise",
+            "float32",
+            shape,
+            axes,
+            {"units": "nJy", "long_name": "noise realisation with the image's correlations"},
+        ),
         Variable("nimages", "uint8", shape, axes, {"long_name": "number of exposures"}),
         Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star at the tile's centre, flat f_nu"}),
     )
-
-

@@ -60,7 +60,9 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     )
 
 
-def objects(detections: TableProduct, coadds: ImageProduct, settings: DetectionSettings, region: Region) -> TableProduct:
+def objects(
+    detections: TableProduct, coadds: ImageProduct, settings: DetectionSettings, region: Region
+) -> TableProduct:
     """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS)."""
     maker = coadds.make
     assert isinstance(maker, DrizzleTile | DrawTile)

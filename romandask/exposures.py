@@ -76,11 +76,21 @@ def exposures(
     coordinates = {name: (axes, table[name].to_numpy(), {}) for name in columns}
     headers = [header_text(instrument.header(exposure_of(table.iloc[row]))) for row in range(len(table))]
     coordinates["exposure"] = (axes, np.array(names, object), {})
-    coordinates["header"] = (axes, np.array(headers, object), {"description": "FITS header of the WCS, 80-column cards"})
+    coordinates["header"] = (
+        axes,
+        np.array(headers, object),
+        {"description": "FITS header of the WCS, 80-column cards"},
+    )
     flags = {"flag_masks": list(DQ_FLAGS.values()), "flag_meanings": " ".join(DQ_FLAGS)}
     planes = (
         Variable("image", "int32", (ny, nx), ("y", "x"), {"units": "electron", "long_name": "observed image"}),
-        Variable("truth", "float32", (ny, nx), ("y", "x"), {"units": "electron", "long_name": "noiseless image of the objects"}),
+        Variable(
+            "truth",
+            "float32",
+            (ny, nx),
+            ("y", "x"),
+            {"units": "electron", "long_name": "noiseless image of the objects"},
+        ),
         Variable("dq", "uint8", (ny, nx), ("y", "x"), {"long_name": "data quality", **flags}),
     )
     return ImageProduct(

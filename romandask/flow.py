@@ -24,7 +24,21 @@ from romandask.survey import Survey
 Product = ImageProduct | TableProduct
 INTERPRETER = 420 << 20
 """Resident memory of a worker before it makes anything, bytes."""
-PACKAGES = ("romandask", "astropy", "dask", "distributed", "drizzle", "galsim", "numba", "numpy", "pyarrow", "scipy", "sep", "xarray", "zarr")
+PACKAGES = (
+    "romandask",
+    "astropy",
+    "dask",
+    "distributed",
+    "drizzle",
+    "galsim",
+    "numba",
+    "numpy",
+    "pyarrow",
+    "scipy",
+    "sep",
+    "xarray",
+    "zarr",
+)
 
 
 @dataclass(frozen=True)
@@ -262,4 +276,3 @@ def run_figures(store: Store) -> list[dict]:
 def stored_versions(store: Store) -> dict[str, str]:
     """Return the package versions that the store was made with."""
     return json.loads((store.root / "versions.json").read_text())
-

@@ -53,16 +53,26 @@ def matches(
         inputs = []
         for product in objects.values():
             pixels = _pixels(product, around[cell], settings.order)
-            inputs += [(product.stage, unit.name) for unit, pixel in zip(product.units, product.pixels or (), strict=True) if pixel in pixels]
+            inputs += [
+                (product.stage, unit.name)
+                for unit, pixel in zip(product.units, product.pixels or (), strict=True)
+                if pixel in pixels
+            ]
         sources.append(tuple(inputs))
     names = [f"{settings.order}-{cell}" for cell in cells]
-    units = tuple(Unit(name, {**state, "cell": cell}, inputs) for name, cell, inputs in zip(names, cells, sources, strict=True))
+    units = tuple(
+        Unit(name, {**state, "cell": cell}, inputs) for name, cell, inputs in zip(names, cells, sources, strict=True)
+    )
     common = (objects, settings, cells, around)
     lengths = settings.linking_lengths
     columns = tuple(map(length_name, lengths))
     size = 500 << 20
-    local = TableProduct("matches/local", units, _Local(*common), schema("local", columns), bytes_per_unit=size, store=store)
-    crossing = TableProduct("matches/crossing", units, _Crossing(*common), schema("crossing"), bytes_per_unit=size, store=store)
+    local = TableProduct(
+        "matches/local", units, _Local(*common), schema("local", columns), bytes_per_unit=size, store=store
+    )
+    crossing = TableProduct(
+        "matches/crossing", units, _Crossing(*common), schema("crossing"), bytes_per_unit=size, store=store
+    )
     upstream = tuple((product.stage, unit.name) for product in (local, crossing) for unit in product.units)
     merged = TableProduct(
         "matches/merged",
@@ -75,7 +85,11 @@ def matches(
     groups = TableProduct(
         "matches/groups",
         tuple(
-            Unit(name, {**state, "cell": cell}, (("matches/local", name), *(("matches/merged", column) for column in columns)))
+            Unit(
+                name,
+                {**state, "cell": cell},
+                (("matches/local", name), *(("matches/merged", column) for column in columns)),
+            )
             for name, cell in zip(names, cells, strict=True)
         ),
         _Relabel(local, merged, columns),
@@ -146,7 +160,9 @@ class _Crossing(_Partition):
         low = np.where(keys[found[:, 0]] < keys[found[:, 1]], 0, 1)
         mine = across & own[np.take_along_axis(found, low[:, None], axis=1)[:, 0]]
         ends = np.sort(keys[found[mine]], axis=1)
-        return pd.DataFrame({"key_1": ends[:, 0], "key_2": ends[:, 1], "separation": gap[mine]}).sort_values(["key_1", "key_2"])
+        return pd.DataFrame({"key_1": ends[:, 0], "key_2": ends[:, 1], "separation": gap[mine]}).sort_values(
+            ["key_1", "key_2"]
+        )
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
 
 
 def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
-    """Return, for each survey, the weight and the number of exposures of a tile in one band: (weight, nimages, band)."""
+    """Return weight and number of exposures of a tile in one band, by survey: (weight, nimages, band)."""
     figure = _figure(4.2 * 2 * len(tiles), 3.9)
     position = 0
     for survey, (weight, count, band) in tiles.items():
@@ -110,7 +110,9 @@ def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
     axes.imshow(np.log10(values + 1), origin="lower", cmap="Blues", aspect="auto")
     for row, column in np.ndindex(values.shape):
         dark = np.log10(values[row, column] + 1) > 0.6 * np.log10(values.max() + 1)
-        axes.text(column, row, f"{int(values[row, column])}", ha="center", va="center", color="white" if dark else "black")
+        axes.text(
+            column, row, f"{int(values[row, column])}", ha="center", va="center", color="white" if dark else "black"
+        )
     axes.set_xticks(range(shown.shape[1]), [str(value) for value in shown.columns])
     axes.set_yticks(range(shown.shape[0]), [str(value) for value in shown.index])
     axes.set_xlabel("Rubin objects in the group")

@@ -29,7 +29,7 @@ from romandask.model.resources import resource_folder
 
 
 class Pipeline(Section):
-    """Everything that decides what a survey contains. A block is named after its instrument; leave it out to leave it out."""
+    """Everything that decides what a survey contains; the block of an instrument may be left out."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     description: str = ""

@@ -35,7 +35,9 @@ def write_report(survey: Survey) -> Path:
         _figures_of_the_run(survey),
     ]
     title = html.escape(f"romandask: {survey.pipeline.name}")
-    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    )
     path = survey.store.report / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page + "".join(sections) + "</html>\n")
@@ -52,7 +54,14 @@ def dag_svg(rows: list[Planned], path: Path) -> None:
     centres = []
     for column, (kind, members) in enumerate(groups.items()):
         lines = [kind] + [f"{row.stage.split('/')[1]}: {row.units}" for row in members]
-        axes.text(column, 0, "\n".join(lines), ha="center", va="center", bbox={"boxstyle": "round", "fc": "#e8eef6", "ec": "#45607f"})
+        axes.text(
+            column,
+            0,
+            "\n".join(lines),
+            ha="center",
+            va="center",
+            bbox={"boxstyle": "round", "fc": "#e8eef6", "ec": "#45607f"},
+        )
         centres.append(column)
     for left in centres[:-1]:
         axes.annotate("", (left + 0.68, 0), (left + 0.36, 0), arrowprops={"arrowstyle": "->"})
@@ -72,7 +81,14 @@ def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     rows = []
     for name, frame in objects.items():
         count = len(survey.pointings(name))
-        rows.append({"survey": name, "exposures": count, "objects": len(frame), "objects / arcmin2": f"{len(frame) / region.area:.1f}"})
+        rows.append(
+            {
+                "survey": name,
+                "exposures": count,
+                "objects": len(frame),
+                "objects / arcmin2": f"{len(frame) / region.area:.1f}",
+            }
+        )
     return text + _table(pd.DataFrame(rows))
 
 
@@ -91,7 +107,10 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
     return (
         "<h2>The same sky</h2>"
-        + _image(pictures.colour_pair(pairs, circled), f"Tile {label} as each survey sees it. Circles: objects that the tile owns.")
+        + _image(
+            pictures.colour_pair(pairs, circled),
+            f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
+        )
         + _image(pictures.maps(layers), "Weight and number of exposures of the tile.")
     )
 
@@ -108,8 +127,14 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
             measured[band] = pictures.ab_magnitude(objects[name][f"{band}_kronFlux"])
     return (
         "<h2>Measurements</h2>"
-        + _image(pictures.magnitude_histograms(true, measured), "Magnitudes: all true objects of the region, and Kron magnitudes of the detected.")
-        + _image(pictures.size_magnitude(objects, middle), "Size and magnitude; point sources form the locus at the PSF's size.")
+        + _image(
+            pictures.magnitude_histograms(true, measured),
+            "Magnitudes: all true objects of the region, and Kron magnitudes of the detected.",
+        )
+        + _image(
+            pictures.size_magnitude(objects, middle),
+            "Size and magnitude; point sources form the locus at the PSF's size.",
+        )
     )
 
 
@@ -120,16 +145,20 @@ def _blends(survey: Survey) -> str:
     for length in lengths:
         counts = statistics.blends(length)
         if counts.size:
-            text += _image(pictures.blend_matrix(counts, length), f"Numbers of groups at a linking length of {length:g} arcsec.")
+            text += _image(
+                pictures.blend_matrix(counts, length), f"Numbers of groups at a linking length of {length:g} arcsec."
+            )
     tables = {length: statistics.unrecognised(length) for length in lengths}
     for length, table in tables.items():
         objects, blends = int(table["rubin_objects"].sum()), int(table["blends"].sum())
         share = f"{blends / objects:.1%}" if objects else "none"
         text += (
-            f"<p>At {length:g} arcsec {blends} of {objects} Rubin objects with a Roman counterpart are unrecognised blends "
-            f"({share}): alone of Rubin in a group with two or more Roman objects.</p>"
+            f"<p>At {length:g} arcsec {blends} of {objects} Rubin objects with a Roman counterpart are unrecognised "
+            f"blends ({share}): alone of Rubin in a group with two or more Roman objects.</p>"
         )
-    return text + _image(pictures.blend_fraction(tables), "Unrecognised blends against i magnitude; errors are binomial.")
+    return text + _image(
+        pictures.blend_fraction(tables), "Unrecognised blends against i magnitude; errors are binomial."
+    )
 
 
 def _figures_of_the_run(survey: Survey) -> str:
@@ -161,7 +190,9 @@ def _busiest_tile(survey: Survey, objects: dict[str, pd.DataFrame]) -> int:
 
 def _image(png: bytes, caption: str) -> str:
     data = base64.b64encode(png).decode()
-    return f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+    text = html.escape(caption)
+    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
 
 
 def _table(frame: pd.DataFrame) -> str:

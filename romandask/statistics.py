@@ -37,7 +37,10 @@ def statistics(
         "blends": _Blends(groups, lengths),
         "unrecognised": _Unrecognised(groups, rubin, lengths, magnitude_band),
     }
-    tables = {name: TableProduct(f"statistics/{name}", unit, maker, schema(name), bytes_per_unit=500 << 20) for name, maker in makers.items()}
+    tables = {
+        name: TableProduct(f"statistics/{name}", unit, maker, schema(name), bytes_per_unit=500 << 20)
+        for name, maker in makers.items()
+    }
     return Statistics(**tables)
 
 
@@ -81,14 +84,18 @@ class _Unrecognised:
     band: str
 
     def __call__(self, index: int) -> pd.DataFrame:
-        flux = pd.concat([self.rubin.load(k)[["objectId", f"{self.band}_kronFlux"]] for k in range(len(self.rubin.units))])
+        flux = pd.concat(
+            [self.rubin.load(k)[["objectId", f"{self.band}_kronFlux"]] for k in range(len(self.rubin.units))]
+        )
         magnitude = 31.4 - 2.5 * np.log10(flux[f"{self.band}_kronFlux"].where(flux[f"{self.band}_kronFlux"] > 0))
         magnitude = pd.Series(magnitude.to_numpy(), index=flux["objectId"].to_numpy())
         parts = []
         for length in self.lengths:
             counts = group_counts(self.groups, length)
             column = f"group_{length_name(length)}"
-            members = pd.concat([self.groups.load(k)[["survey", "objectId", column]] for k in range(len(self.groups.units))])
+            members = pd.concat(
+                [self.groups.load(k)[["survey", "objectId", column]] for k in range(len(self.groups.units))]
+            )
             members = members[members["survey"] == "rubin"]
             of_group = counts.loc[members[column]]
             seen = of_group["roman"].to_numpy() >= 1

@@ -109,7 +109,9 @@ class Survey:
     @cached_property
     def bandpasses(self) -> dict[str, Bandpass]:
         """All bands of all instruments; the truth holds a flux for each."""
-        return {band: instrument.bandpass(band) for instrument in self.instruments.values() for band in instrument.bands}
+        return {
+            band: instrument.bandpass(band) for instrument in self.instruments.values() for band in instrument.bands
+        }
 
     @property
     def data(self) -> Path:
@@ -132,11 +134,16 @@ class Survey:
         block = getattr(settings, survey)
         state = {
             "settings": block.model_dump(), "region": settings.region.model_dump(), "seed": settings.seed,
-            "coadds": settings.coadds.model_dump(exclude={"pixfrac"}), "source": _state(self.data, block.pointings.path),
+            "coadds": settings.coadds.model_dump(exclude={"pixfrac"}),
+            "source": _state(self.data, block.pointings.path),
         }  # fmt: skip
         return self._stored(
             TableProduct(
-                f"pointings/{survey}", (Unit("all", state),), _MakePointings(self, survey), schema("pointings"), bytes_per_unit=1 << 30
+                f"pointings/{survey}",
+                (Unit("all", state),),
+                _MakePointings(self, survey),
+                schema("pointings"),
+                bytes_per_unit=1 << 30,
             )
         )
 
@@ -159,9 +166,7 @@ class Survey:
     def detection_product(self, survey: str) -> TableProduct:
         """The detections of each tile."""
         settings = self.pipeline.detections
-        return self._once(
-            "detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region)
-        )
+        return self._once("detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region))
 
     def object_product(self, survey: str) -> TableProduct:
         """The object table."""
@@ -176,14 +181,14 @@ class Survey:
     def match_products(self) -> Matches:
         """The stages of friends of friends."""
         tables = {name: self.object_product(name) for name in self.instruments}
-        return self._once(
-            "matches", "all", lambda: matches(tables, self.pipeline.matches, self.region, self.store)
-        )
+        return self._once("matches", "all", lambda: matches(tables, self.pipeline.matches, self.region, self.store))
 
     @property
     def statistic_products(self) -> Statistics:
         """The tables of the statistics stage."""
-        made = statistics(self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths)
+        made = statistics(
+            self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths
+        )
         return Statistics(self._stored(made.blends), self._stored(made.unrecognised))
 
     def footprints(self, survey: str) -> np.ndarray:
@@ -281,5 +286,3 @@ def open_survey(path: str | Path) -> Survey:
     if not store.pipeline.is_file():
         raise UserError(f"{path}: not a romandask store (it has no pipeline.yaml); make one with romandask run")
     return Survey(load_pipeline(store.pipeline), store)
-
-

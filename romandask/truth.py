@@ -105,14 +105,23 @@ def truth(
             cells = np.intersect1d(cells, region.cells(settings.order, settings.margin))
         options = (settings, region, bandpasses, source, library, unusable, cells)
         makers = {
-            "galaxies": _ReadGalaxies(*options), "stars": _ReadStars(*options), "quarantine": _ReadBad(source, unusable, tuple(parents))
+            "galaxies": _ReadGalaxies(*options), "stars": _ReadStars(*options),
+            "quarantine": _ReadBad(source, unusable, tuple(parents)),
         }  # fmt: skip
         source_state = {"files": source.files(), "seds": list(library.names)}
         edges = source.edges
         rows = skycatalogs.count_rows(source, parents)
-        files = [f"{kind}_{cell}" for cell in parents for kind in ("galaxy", "pointsource") if cell in _kind(source, kind)]
+        files = [
+            f"{kind}_{cell}" for cell in parents for kind in ("galaxy", "pointsource") if cell in _kind(source, kind)
+        ]
     bands = tuple(bandpasses)
-    state = {"settings": settings.model_dump(), "seed": seed, "source": source_state, "bands": bands, "region": vars(region)}
+    state = {
+        "settings": settings.model_dump(),
+        "seed": seed,
+        "source": source_state,
+        "bands": bands,
+        "region": vars(region),
+    }
     units = tuple(Unit(f"{settings.order}-{cell}", {**state, "cell": int(cell)}) for cell in cells)
     per_cell = int(cell_area(settings.order) * settings.galaxies * 1500) + (200 << 20)
 
@@ -272,7 +281,12 @@ class _ReadBad:
     parents: tuple[int, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
-        pairs = [(cell, kind) for cell in self.parents for kind in ("galaxy", "pointsource") if cell in _kind(self.source, kind)]
+        pairs = [
+            (cell, kind)
+            for cell in self.parents
+            for kind in ("galaxy", "pointsource")
+            if cell in _kind(self.source, kind)
+        ]
         cell, kind = pairs[index]
         if kind == "galaxy":
             frame, name = skycatalogs.read_galaxies(self.source, cell), "galaxy_id"

@@ -69,7 +69,9 @@ class SmallSurvey:
         # the detector of interest lies off the boresight: shift the boresights by half a detector
         self.exposures = [replace(base, visit=k, dec=-40.0 + k * 14 / 3600, mjd=61541.0 + k) for k in range(3)]
         corners = np.stack([footprint(self.roman.header(e), self.roman.shape) for e in self.exposures])
-        rows = [vars(e) | dict(zip(CORNERS, c.ravel(), strict=True)) for e, c in zip(self.exposures, corners, strict=True)]
+        rows = [
+            vars(e) | dict(zip(CORNERS, c.ravel(), strict=True)) for e, c in zip(self.exposures, corners, strict=True)
+        ]
         self.table = pd.DataFrame(rows)
         ra, dec = corners[..., 0], corners[..., 1]
         self.region = Region(ra.min(), ra.max(), dec.min(), dec.max())

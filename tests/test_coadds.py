@@ -57,7 +57,11 @@ def test_flux_is_conserved_through_distortion_and_roll(small):
     areas = pixel_areas(header, small.roman.shape)
     sums = Sums(shape, 1, 1.0)
     sums.add(
-        ([(image / areas)[p.rows, p.columns]], np.ones_like(image)[p.rows, p.columns], pixel_map(source, target, p.rows, p.columns))
+        (
+            [(image / areas)[p.rows, p.columns]],
+            np.ones_like(image)[p.rows, p.columns],
+            pixel_map(source, target, p.rows, p.columns),
+        )
         for p in strips(source, small.roman.shape, target, shape)
     )
     assert sums.image(0).sum() * 0.0575**2 == pytest.approx(1500.0, rel=1e-3)

@@ -56,7 +56,12 @@ def test_files_that_are_not_pipelines(tmp_path):
     (tmp_path / "list.yaml").write_text("- a\n- b\n")
     (tmp_path / "broken.yaml").write_text("a: [1\nb: 2")
     (tmp_path / "code.yaml").write_text("!!python/object/apply:os.system [echo]")
-    for name, word in (("list", "mapping"), ("broken", "not valid YAML"), ("code", "not valid YAML"), ("none", "no such pipeline")):
+    for name, word in (
+        ("list", "mapping"),
+        ("broken", "not valid YAML"),
+        ("code", "not valid YAML"),
+        ("none", "no such pipeline"),
+    ):
         with pytest.raises(UserError, match=word):
             load_pipeline(tmp_path / f"{name}.yaml")
 

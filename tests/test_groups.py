@@ -1,6 +1,5 @@
 """Friends of friends against brute force, whatever the partitions."""
 
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -74,7 +73,9 @@ def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
     owner = full["_healpix_29"].to_numpy() >> 2 * (29 - order)
     parts = [full[owner == cell].reset_index(drop=True) for cell in cells]
     assert sum(map(len, parts)) == len(frame)
-    return TableProduct(f"objects/{name}", tuple(Unit(str(c), c) for c in cells), lambda k: parts[k], columns, cells, order)
+    return TableProduct(
+        f"objects/{name}", tuple(Unit(str(c), c) for c in cells), lambda k: parts[k], columns, cells, order
+    )
 
 
 def stored_matches(products, settings: MatchSettings, folder) -> Matches:
@@ -95,7 +96,14 @@ def clumped():
         centre = random.uniform(-30, 30, (2, 150))
         member = random.integers(0, 150, count)
         ra, dec = centre[:, member] + random.normal(0, 0.6, (2, count))
-        return pd.DataFrame({"objectId": np.arange(count) + 7, "coord_ra": (ra / 3600) % 360, "coord_dec": dec / 3600, "i_kronFlux": 500.0})
+        return pd.DataFrame(
+            {
+                "objectId": np.arange(count) + 7,
+                "coord_ra": (ra / 3600) % 360,
+                "coord_dec": dec / 3600,
+                "i_kronFlux": 500.0,
+            }
+        )
 
     return frame(500), frame(260)
 

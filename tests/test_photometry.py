@@ -13,7 +13,9 @@ from romandask.kernels.photometry import njy, node_photons, transmission
 from romandask.model.spectra import LibrarySpectra, TophatSpectra
 
 NAMES = ("CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im")
-AT_500 = galsim.Bandpass(galsim.LookupTable([499.95, 500.05], [1.0, 1.0], interpolant="linear"), "nm").withZeropoint("AB")
+AT_500 = galsim.Bandpass(galsim.LookupTable([499.95, 500.05], [1.0, 1.0], interpolant="linear"), "nm").withZeropoint(
+    "AB"
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +59,12 @@ def test_dust_acts_in_its_own_frame(library):
     one = np.ones(1)
     milky_way = rates(library, [(2, 24.0, 0.8)], bandpass, mw_av=0.4 * one, mw_rv=3.1 * one).sum()
     expected = galsim_rate(
-        NAMES[2], 24.0, 0.8, reference, 3e5, lambda wave: transmission("F19", wave[None], np.array([0.4]), np.array([3.1]))[0]
+        NAMES[2],
+        24.0,
+        0.8,
+        reference,
+        3e5,
+        lambda wave: transmission("F19", wave[None], np.array([0.4]), np.array([3.1]))[0],
     )
     assert -2.5 * np.log10(milky_way / expected) == pytest.approx(0, abs=3e-3)
     internal = rates(library, [(2, 24.0, 0.8)], bandpass, internal_av=0.4 * one, internal_rv=3.1 * one).sum()

@@ -45,7 +45,10 @@ def test_exposures_from_the_real_obseq_cover_a_region(shared):
     table = pointings(roman, settings, shared, region, GRID.covering(region), GRID.side, 1)
     assert len(table) >= 4
     assert set(table["visit"]) <= set(visits["visit"])
-    assert touching_pairs(corners_of(table), np.stack([t.corners(GRID.side) for t in GRID.covering(region)]))[0].max() == len(table) - 1
+    assert (
+        touching_pairs(corners_of(table), np.stack([t.corners(GRID.side) for t in GRID.covering(region)]))[0].max()
+        == len(table) - 1
+    )
 
 
 @pytest.mark.parametrize("keep", [100, 3000, 300_000])
@@ -61,7 +64,9 @@ def test_an_obseq_with_a_missing_column_or_a_nan(tmp_path):
     path = tmp_path / "o.fits"
 
     def write(skip=None, **changed):
-        made = [fits.Column(name, "D", array=changed.get(name, values)) for name, values in columns.items() if name != skip]
+        made = [
+            fits.Column(name, "D", array=changed.get(name, values)) for name, values in columns.items() if name != skip
+        ]
         made += [fits.Column("filter", "4A", array=["H158", "F184"])]
         fits.BinTableHDU.from_columns(made).writeto(path, overwrite=True)
 
@@ -103,7 +108,9 @@ def test_the_plan_covers_the_region_and_keeps_to_the_sun():
     for row in visits.iloc[::40].itertuples():
         assert abs((row.pa - best_roll(row.ra, row.dec, row.mjd) + 180) % 360 - 180) < 15
     table = pointings(roman, RomanPointings(), Path("."), REGION, TILES, GRID.side, 0)
-    points = np.array([[[a, d], [a + 1e-6, d], [a, d + 1e-6]] for a in (53.02, 53.03, 53.045) for d in (-40.012, -40.002)])
+    points = np.array(
+        [[[a, d], [a + 1e-6, d], [a, d + 1e-6]] for a in (53.02, 53.03, 53.045) for d in (-40.012, -40.002)]
+    )
     for band in roman.bands:
         found, _ = touching_pairs(points, corners_of(table[table["band"] == band]))
         assert (np.bincount(found, minlength=len(points)) >= 3).all()

@@ -70,7 +70,11 @@ def moments(image):
 def test_objects_agree_with_galsim(basis, psfs, kind, hlr, g1, g2):
     flux, x, y = 2e4, 63.31, 64.77
     shear = galsim.Shear(g1=g1, g2=g2)
-    profile = {POINT: None, EXPONENTIAL: galsim.Exponential(half_light_radius=hlr), DEVAUCOULEURS: galsim.DeVaucouleurs(half_light_radius=hlr)}[kind]
+    profile = {
+        POINT: None,
+        EXPONENTIAL: galsim.Exponential(half_light_radius=hlr),
+        DEVAUCOULEURS: galsim.DeVaucouleurs(half_light_radius=hlr),
+    }[kind]
     profile = profile.shear(shear) if profile else None
     image = draw(one(kind, shear.getMatrix() * hlr / SCALE, flux, x, y), basis, (128, 128), 1e-4)
     expected = reference(profile, psfs, flux, x, y, 128)
@@ -143,7 +147,9 @@ def test_a_position_angle_runs_east_of_north(basis):
     assert position_angle(drawn_on_the_sky(basis, frame)) == pytest.approx(30.0, abs=0.5)
 
 
-@pytest.mark.parametrize(("shear_1", "shear_2", "angle"), [(0.4, 0.0, 90.0), (-0.4, 0.0, 0.0), (0.0, 0.4, 135.0), (0.0, -0.4, 45.0)])
+@pytest.mark.parametrize(
+    ("shear_1", "shear_2", "angle"), [(0.4, 0.0, 90.0), (-0.4, 0.0, 0.0), (0.0, 0.4, 135.0), (0.0, -0.4, 45.0)]
+)
 def test_a_sheared_round_galaxy_has_the_position_angle_of_galsims_sky_convention(basis, shear_1, shear_2, angle):
     """GalSim's sky frame is (west, north): positive g1 stretches east-west, positive g2 north-west to south-east."""
     image = drawn_on_the_sky(basis, galaxies(shear_1=shear_1, shear_2=shear_2))
@@ -155,7 +161,14 @@ def test_a_sheared_round_galaxy_has_the_position_angle_of_galsims_sky_convention
 
 
 def test_lensing_is_galsims(basis, psfs):
-    frame = galaxies(shear_1=0.05, shear_2=-0.08, convergence=0.1, size_disk_true=0.6, size_minor_disk_true=0.3, position_angle_unlensed=70.0)
+    frame = galaxies(
+        shear_1=0.05,
+        shear_2=-0.08,
+        convergence=0.1,
+        size_disk_true=0.6,
+        size_minor_disk_true=0.3,
+        position_angle_unlensed=70.0,
+    )
     g1, g2 = 0.05 / 0.9, -0.08 / 0.9
     mu = magnification(frame)[0]
     assert mu == pytest.approx(1 / (0.9**2 - 0.05**2 - 0.08**2))
@@ -183,16 +196,17 @@ def test_light_from_beyond_the_edge_falls_on_the_image(basis):
 
 
 def test_a_galaxy_agrees_with_galsim_through_spectra_lensing_and_the_exact_wcs():
-    """Two components of different colours, redshifted, lensed, drawn by GalSim chromatically on the exposure's own WCS."""
+    """Two components of different colours, redshifted and lensed, against GalSim's chromatic drawing on the WCS."""
     roman = Roman(RomanSettings(), n_waves=3)
     exposure = Exposure(0, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)
     header = roman.header(exposure)
     wcs = WCS(header)
     ra, dec = wcs.all_pix2world(3000.3, 1200.6, 0)
     row = {
-        "galaxy_id": 5, "ra": float(ra), "dec": float(dec), "redshift": 0.6, "shear_1": 0.03, "shear_2": -0.05, "convergence": 0.05,
-        "size_bulge_true": 0.2, "size_minor_bulge_true": 0.15, "size_disk_true": 0.5, "size_minor_disk_true": 0.25,
-        "position_angle_unlensed": 25.0, "bulge_magnorm": 21.0, "disk_magnorm": 21.0, "knots_magnorm": np.inf, "n_knots": 0,
+        "galaxy_id": 5, "ra": float(ra), "dec": float(dec), "redshift": 0.6, "shear_1": 0.03, "shear_2": -0.05,
+        "convergence": 0.05, "size_bulge_true": 0.2, "size_minor_bulge_true": 0.15, "size_disk_true": 0.5,
+        "size_minor_disk_true": 0.25, "position_angle_unlensed": 25.0, "bulge_magnorm": 21.0, "disk_magnorm": 21.0,
+        "knots_magnorm": np.inf, "n_knots": 0,
         "bulge_av": 0.0, "bulge_rv": 3.1, "disk_av": 0.0, "disk_rv": 3.1, "MW_av": 0.0, "MW_rv": 3.1,
         "bulge_sed": 0, "disk_sed": 3, "knots_sed": 3,
     }  # fmt: skip
@@ -203,14 +217,18 @@ def test_a_galaxy_agrees_with_galsim_through_spectra_lensing_and_the_exact_wcs()
     image = draw(scene, roman.psf(exposure, 256), roman.shape, 0.01)[1200 - 48 : 1200 + 49, 3000 - 48 : 3000 + 49]
 
     band = galsim.roman.getBandpasses(AB_zeropoint=True)["H158"]
-    at_500 = galsim.Bandpass(galsim.LookupTable([499.95, 500.05], [1.0, 1.0], interpolant="linear"), "nm").withZeropoint("AB")
+    at_500 = galsim.Bandpass(
+        galsim.LookupTable([499.95, 500.05], [1.0, 1.0], interpolant="linear"), "nm"
+    ).withZeropoint("AB")
     celestial = galsim.FitsWCS(header=galsim.FitsHeader(header))
     # FITS pixels count from 1
     local = celestial.local(galsim.PositionD(3001.3, 1201.6))
     mu = 1 / (0.95**2 - 0.03**2 - 0.05**2)
 
     def component(profile, major, minor, sed):
-        shaped = profile(half_light_radius=np.sqrt(major * minor)).shear(q=minor / major, beta=(90 + 25) * galsim.degrees)
+        shaped = profile(half_light_radius=np.sqrt(major * minor)).shear(
+            q=minor / major, beta=(90 + 25) * galsim.degrees
+        )
         spectrum = galsim.SED(f"{sed}_ext_more.sed", "Ang", "flambda").withMagnitude(21.0, at_500).atRedshift(0.6)
         return shaped.lens(0.03 / 0.95, -0.05 / 0.95, mu) * spectrum
 

@@ -19,5 +19,7 @@ def test_the_same_identity_gives_the_same_numbers_and_no_other_does():
 
 def test_sums_and_products_of_identities_do_not_collide():
     """visit * sca and seed + visit + sca, as public pipelines have it, would repeat many of these."""
-    drawn = {rng(seed, "x", visit, sca).integers(1 << 62) for seed in range(3) for visit in range(40) for sca in range(18)}
+    drawn = {
+        rng(seed, "x", visit, sca).integers(1 << 62) for seed in range(3) for visit in range(40) for sca in range(18)
+    }
     assert len(drawn) == 3 * 40 * 18

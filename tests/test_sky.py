@@ -50,8 +50,17 @@ def test_touching_squares_are_found_anywhere_on_the_sphere(ra, dec, east, north,
 
 def test_pairs_do_not_change_when_the_sky_turns():
     random = np.random.default_rng(3)
-    a = np.stack([square(r, d, 0.2, t) for r, d, t in zip(random.uniform(-2, 2, 60), random.uniform(88, 89.9, 60), random.uniform(0, 90, 60), strict=True)])
-    b = np.stack([square(r, d, 0.3, 10) for r, d in zip(random.uniform(-180, 180, 40), random.uniform(88, 90, 40), strict=True)])
+    a = np.stack(
+        [
+            square(r, d, 0.2, t)
+            for r, d, t in zip(
+                random.uniform(-2, 2, 60), random.uniform(88, 89.9, 60), random.uniform(0, 90, 60), strict=True
+            )
+        ]
+    )
+    b = np.stack(
+        [square(r, d, 0.3, 10) for r, d in zip(random.uniform(-180, 180, 40), random.uniform(88, 90, 40), strict=True)]
+    )
     pairs = np.stack(touching_pairs(a, b))
     turn = np.array([123.4, 0.0])
     np.testing.assert_array_equal(pairs, np.stack(touching_pairs(a + turn, b + turn)))

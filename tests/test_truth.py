@@ -48,7 +48,10 @@ def test_the_source_density_and_the_magnitudes_are_the_surveys():
     frame = made(8).galaxies.all_rows()
     expected = 597.2 * REGION.area
     assert len(frame) == pytest.approx(expected, abs=5 * np.sqrt(expected))
-    mag = 31.4 - 2.5 * np.log10(frame["flux_r"] / frame.pipe(lambda f: 1 / ((1 - f["convergence"]) ** 2 - f["shear_1"] ** 2 - f["shear_2"] ** 2)))
+    mag = 31.4 - 2.5 * np.log10(
+        frame["flux_r"]
+        / frame.pipe(lambda f: 1 / ((1 - f["convergence"]) ** 2 - f["shear_1"] ** 2 - f["shear_2"] ** 2))
+    )
     assert mag.max() < 29.001, "r < 29 before magnification"
     slope = np.log10((mag < 28).sum() / (mag < 26).sum()) / 2
     assert slope == pytest.approx((2.475 - 1.84) / 2, abs=0.05)
@@ -114,7 +117,9 @@ def test_the_real_sample_reads_with_its_inf_and_nan(shared):
 def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
     """Fluxes of the published files (other throughputs): the same objects, the same colours to their scatter."""
     galaxies = sample(shared).galaxies.all_rows()
-    reference = pd.concat(pd.read_parquet(shared / "skycatalogs_sample" / f"galaxy_flux_{pixel}.parquet") for pixel in (9683, 9556))
+    reference = pd.concat(
+        pd.read_parquet(shared / "skycatalogs_sample" / f"galaxy_flux_{pixel}.parquet") for pixel in (9683, 9556)
+    )
     both = galaxies.merge(reference, on="galaxy_id")
     both = both[(both["lsst_flux_r"] > 1e-6) & (both["flux_r"] > 0)]
     assert len(both) > 200
@@ -125,10 +130,15 @@ def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
 
 def test_every_row_of_the_sample_is_out_or_in_quarantine(shared):
     whole = Region(0, 360, -90, 90)
-    catalogs = truth(TruthSettings(source="skycatalogs", path="skycatalogs_sample", seds="seds", order=5), shared, whole, BANDS, 1)
+    catalogs = truth(
+        TruthSettings(source="skycatalogs", path="skycatalogs_sample", seds="seds", order=5), shared, whole, BANDS, 1
+    )
     out = len(catalogs.galaxies.all_rows()) + len(catalogs.stars.all_rows())
     assert catalogs.source_rows == out + len(catalogs.quarantine.all_rows())
-    files = [*(shared / "skycatalogs_sample").glob("galaxy_[0-9]*.parquet"), *(shared / "skycatalogs_sample").glob("pointsource_[0-9]*.parquet")]
+    files = [
+        *(shared / "skycatalogs_sample").glob("galaxy_[0-9]*.parquet"),
+        *(shared / "skycatalogs_sample").glob("pointsource_[0-9]*.parquet"),
+    ]
     assert catalogs.source_rows == sum(pq.read_metadata(path).num_rows for path in files)
 
 

@@ -65,7 +65,9 @@ def open_source(folder: Path) -> Source:
         factor = {"angstrom": 0.1, "nm": 1.0}[content["SED_models"]["tophat"]["units"]]
         edges = tuple(factor * start for start, _ in bins) + (factor * (bins[-1][0] + bins[-1][1]),)
     except (KeyError, TypeError, ValueError, IndexError):
-        raise UserError(f"{config}: key SED_models.tophat (bins, units) is missing or not as skyCatalogs writes it") from None
+        raise UserError(
+            f"{config}: key SED_models.tophat (bins, units) is missing or not as skyCatalogs writes it"
+        ) from None
     galaxies = _files(folder, r"galaxy_(\d+)\.parquet")
     stars = _files(folder, r"pointsource_(\d+)\.parquet")
     if not galaxies:
@@ -117,7 +119,9 @@ def sed_names(source: Source, cells: list[int]) -> list[str]:
     names: set[str] = set()
     for cell in cells:
         if cell in source.stars:
-            names.update(pq.read_table(source.stars[cell], columns=["sed_filepath"])["sed_filepath"].unique().to_pylist())
+            names.update(
+                pq.read_table(source.stars[cell], columns=["sed_filepath"])["sed_filepath"].unique().to_pylist()
+            )
     return sorted(name for name in names if name)
 
 

@@ -87,7 +87,7 @@ class Instrument(Protocol):
         """Return visits that cover a region: the columns of Exposure without the detector."""
 
     def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
-        """Return the corners (4, 2), degrees, of at least those detectors of a visit that reach into a cone (degrees)."""
+        """Return the corners (4, 2) of at least those detectors of a visit that reach into a cone; degrees."""
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact FITS header of an exposure."""

@@ -144,7 +144,10 @@ class Roman:
         """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current."""
         coord = galsim.CelestialCoord(header["CRVAL1"] * galsim.degrees, header["CRVAL2"] * galsim.degrees)
         level = galsim.roman.getSkyLevel(
-            galsim_roman_bandpasses()[exposure.band], world_pos=coord, date=_date(exposure.mjd), exptime=exposure.exptime
+            galsim_roman_bandpasses()[exposure.band],
+            world_pos=coord,
+            date=_date(exposure.mjd),
+            exptime=exposure.exptime,
         )
         level *= 1 + galsim.roman.stray_light_fraction
         flat = galsim.roman.thermal_backgrounds[exposure.band] + galsim.roman.dark_current
@@ -156,7 +159,7 @@ class Roman:
 
 
 def first_observable(ra: float, dec: float, start: float) -> float:
-    """Return the first whole day from `start` (MJD) on which a position is within the limits of the Sun's elongation."""
+    """Return the first day from `start` (MJD), in whole days, on which the Sun's elongation allows a position."""
     for day in range(400):
         if best_roll(ra, dec, start + day) is not None:
             return start + day

@@ -150,7 +150,9 @@ class Rubin:
         transfers = []
         for wave in nodes:
             fwhm = seeing * (wave / 500) ** -0.3 * thickness
-            transfers.append(share @ kolmogorov_transfer(frequency[None], fwhm[:, None], SYSTEM_FWHM * thickness[:, None]))
+            transfers.append(
+                share @ kolmogorov_transfer(frequency[None], fwhm[:, None], SYSTEM_FWHM * thickness[:, None])
+            )
         return radial_basis(frequency, np.array(transfers), SCALE, size)
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:

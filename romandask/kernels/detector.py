@@ -34,7 +34,7 @@ def observe(
     background : (ny, nx) or scalar; electrons of sky, thermal emission and dark current
 
     Poisson noise is drawn once per pixel from objects and background together, then clipped at saturation, then
-    Gaussian read noise is added (paper, section 4.3, simple model). Rows are drawn in order, in blocks that bound memory.
+    Gaussian read noise is added (paper, section 4.3, simple model). Rows are drawn in blocks that bound memory.
     """
     image = np.empty(expected.shape, np.int32)
     dq = np.zeros(expected.shape, np.uint8)
@@ -57,7 +57,12 @@ NOISE_ROWS = 256
 
 
 def noise_realisation(
-    background: np.ndarray, detector: Detector, width: int, rows: slice, columns: slice, generator: Callable[[int], np.random.Generator]
+    background: np.ndarray,
+    detector: Detector,
+    width: int,
+    rows: slice,
+    columns: slice,
+    generator: Callable[[int], np.random.Generator],
 ) -> np.ndarray:
     """Return the noise (float32, electrons) of an empty field: zero mean, the variance of background and read noise.
 
@@ -73,5 +78,7 @@ def noise_realisation(
     for block in range(rows.start // NOISE_ROWS, -(-rows.stop // NOISE_ROWS)):
         first, last = max(rows.start, block * NOISE_ROWS), min(rows.stop, (block + 1) * NOISE_ROWS)
         drawn = generator(block).standard_normal((NOISE_ROWS, width), dtype=np.float32)
-        noise[first - rows.start : last - rows.start] = drawn[first - block * NOISE_ROWS : last - block * NOISE_ROWS, columns]
+        noise[first - rows.start : last - rows.start] = drawn[
+            first - block * NOISE_ROWS : last - block * NOISE_ROWS, columns
+        ]
     return noise * np.sqrt(background + np.float32(detector.read_noise**2))

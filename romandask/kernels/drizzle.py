@@ -68,7 +68,9 @@ class Sums:
     """The running weighted sums of images drizzled onto one grid; all images of an exposure share map and weight."""
 
     def __init__(self, shape: tuple[int, int], planes: int, pixfrac: float):
-        self._drizzles = [Drizzle(kernel="square", fillval="0", out_shape=shape, disable_ctx=True) for _ in range(planes)]
+        self._drizzles = [
+            Drizzle(kernel="square", fillval="0", out_shape=shape, disable_ctx=True) for _ in range(planes)
+        ]
         self._pixfrac = pixfrac
         self.count = np.zeros(shape, np.uint8)
         """Number of exposures that contribute to each pixel."""

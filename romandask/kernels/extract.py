@@ -89,7 +89,7 @@ def median_layer(layers: list[Layer]) -> Layer:
 
 
 def mean_layer(layers: list[Layer]) -> Layer:
-    """Return the mean of bands weighted with the inverse variance of their typical pixel: the best for a flat spectrum."""
+    """Return the mean of bands with inverse-variance weights: the best for a flat spectrum."""
     total = np.zeros(layers[0].image.shape)
     image, noise = total.copy(), total.copy()
     for layer in layers:
@@ -100,7 +100,14 @@ def mean_layer(layers: list[Layer]) -> Layer:
         noise += weight * layer.noise
     good = total > 0
     safe = np.where(good, total, 1)
-    return Layer((image / safe).astype(np.float32), (noise / safe).astype(np.float32), total.astype(np.float32), None, 0.0, _mean_psf(layers))
+    return Layer(
+        (image / safe).astype(np.float32),
+        (noise / safe).astype(np.float32),
+        total.astype(np.float32),
+        None,
+        0.0,
+        _mean_psf(layers),
+    )
 
 
 def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast: float) -> Found:
@@ -132,7 +139,9 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
     radius = np.where(np.isfinite(radius), radius, 0.0)
     radius = np.maximum(KRON_FACTOR * radius, KRON_MIN / np.sqrt(a * b))
     flux, flux_error, flag = ellipse_flux(layer, error, x, y, a, b, theta, radius)
-    half, half_flag = sep.flux_radius(image, x, y, 6.0 * a + 5, 0.5, normflux=np.where(flux > 0, flux, 1.0), mask=mask, subpix=5)
+    half, half_flag = sep.flux_radius(
+        image, x, y, 6.0 * a + 5, 0.5, normflux=np.where(flux > 0, flux, 1.0), mask=mask, subpix=5
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = np.where(flux_error > 0, flux / flux_error, 0.0)
     half = np.where(np.isfinite(half) & (half > 0), half, 1.0)
@@ -181,7 +190,9 @@ def noise_ratios(layer: Layer, error: np.ndarray) -> np.ndarray:
             break
         x = random.uniform(radius, nx - 1 - radius, _NOISE_TRIALS)
         y = random.uniform(radius, ny - 1 - radius, _NOISE_TRIALS)
-        flux, white, flag = sep.sum_circle(np.ascontiguousarray(layer.noise), x, y, radius, err=error, mask=mask, subpix=5)
+        flux, white, flag = sep.sum_circle(
+            np.ascontiguousarray(layer.noise), x, y, radius, err=error, mask=mask, subpix=5
+        )
         good = (flag == 0) & (white > 0)
         if good.sum() > 50:
             ratios[k] = np.std(flux[good] / white[good])
@@ -189,7 +200,7 @@ def noise_ratios(layer: Layer, error: np.ndarray) -> np.ndarray:
 
 
 def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
-    """Return flux and error of every object as a point source at its position: unweighted fit of the PSF in a window."""
+    """Return flux and error of every object as a point source: unweighted fit of the PSF in a window."""
     error = layer.error()
     flux, norm = _psf_fit(layer.image, layer.psf, found.x, found.y)
     random = np.random.default_rng(0)
@@ -212,7 +223,9 @@ def psf_half_light_radius(psf: np.ndarray) -> float:
     return float(radius[0])
 
 
-def _windowed(image: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _windowed(
+    image: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return positions under a Gaussian window (XWIN, YWIN): neighbours pull barycentres, and less these.
 
     Where the window wanders off by more than the object's half-light radius the barycentre stays.
@@ -231,7 +244,12 @@ def _psf_fit(image: np.ndarray, psf: np.ndarray, x: np.ndarray, y: np.ndarray) -
     middle = (psf.shape[0] - 1) / 2
     smooth = ndimage.spline_filter(psf.astype(float), order=5)
     ix, iy = np.rint(x).astype(int), np.rint(y).astype(int)
-    inside = (ix >= PSF_RADIUS) & (iy >= PSF_RADIUS) & (ix < image.shape[1] - PSF_RADIUS) & (iy < image.shape[0] - PSF_RADIUS)
+    inside = (
+        (ix >= PSF_RADIUS)
+        & (iy >= PSF_RADIUS)
+        & (ix < image.shape[1] - PSF_RADIUS)
+        & (iy < image.shape[0] - PSF_RADIUS)
+    )
     rows = np.flatnonzero(inside)
     for first in range(0, len(rows), 512):
         part = rows[first : first + 512]

@@ -67,7 +67,7 @@ def draw(scene: Scene, basis: PsfBasis, shape: tuple[int, int], faintest: float)
     half = size // 2
     near = (scene.x > -half) & (scene.x < shape[1] - 1 + half) & (scene.y > -half) & (scene.y < shape[0] - 1 + half)
     start = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
-    table = _devaucouleurs_table()
+    table, photons = _devaucouleurs_table(), scene.photons.astype(np.float32)
     for stamp in np.unique(size[near]):
         chosen = np.flatnonzero(near & (size == stamp))
         batch = max(1, _BATCH_BYTES // (stamp * stamp * 12))
@@ -76,7 +76,7 @@ def draw(scene: Scene, basis: PsfBasis, shape: tuple[int, int], faintest: float)
             transforms = np.zeros((len(rows), stamp, stamp // 2 + 1), np.complex64)
             _fill(
                 transforms, rows, scene.x, scene.y, scene.key, start, scene.kind, scene.matrix, scene.smoothing,
-                scene.knots, scene.photons.astype(np.float32), basis.transforms, basis.size // stamp, basis.folds, table,
+                scene.knots, photons, basis.transforms, basis.size // stamp, basis.folds, table,
             )  # fmt: skip
             _add(image, fft.irfft2(transforms, s=(stamp, stamp), overwrite_x=True), rows, scene.x, scene.y)
     return image

@@ -91,7 +91,7 @@ def shape_matrices(galaxies: pd.DataFrame, component: str) -> tuple[np.ndarray, 
 
 
 def pixel_positions(wcs: WCS, ra, dec) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pixel x, y (0 at the first pixel's centre) and the local (n, 2, 2) matrix from (west, north) arcsec to pixels.
+    """Return pixel x, y (0 at the first pixel's centre) and the local matrix (n, 2, 2) from (west, north) to pixels.
 
     Positions that the WCS cannot reach (the other side of the sky) are NaN.
     """
@@ -120,9 +120,7 @@ def build_scene(truth: Truth, wcs: WCS, bandpass: Bandpass, exptime: float, knot
     knot_smoothing : sigma, arcsec, of the Gaussian that smooths each knot before lensing; 0 for none
     """
     galaxies, stars = truth.galaxies, truth.stars
-    x, y, to_pixels = pixel_positions(
-        wcs, np.r_[galaxies["ra"], stars["ra"]], np.r_[galaxies["dec"], stars["dec"]]
-    )
+    x, y, to_pixels = pixel_positions(wcs, np.r_[galaxies["ra"], stars["ra"]], np.r_[galaxies["dec"], stars["dec"]])
     n, m = len(galaxies), len(stars)
     parts = [_Part(np.arange(n, n + m), POINT, np.zeros((m, 2, 2)), star_photons(truth, bandpass))]
     kinds = {"bulge": DEVAUCOULEURS, "disk": EXPONENTIAL, "knots": KNOTS}

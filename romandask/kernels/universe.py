@@ -1,4 +1,4 @@
-"""A plausible truth universe, one small HEALPix cell at a time: counts, redshifts, sizes, colours, smooth lensing, stars.
+"""A plausible truth universe, a small HEALPix cell at a time: counts, redshifts, sizes, colours, lensing, stars.
 
 Cells of a fixed order are the unit of randomness, so the rows do not depend on how the catalog is partitioned.
 """
@@ -23,20 +23,23 @@ STAR_TEMPERATURES = (2600, 3000, 3400, 3800, 4400, 5000, 5700, 6500, 8000, 11000
 """Kelvin, of the blackbodies that stand in for stars."""
 
 GALAXY_COUNTS = np.array(
-    [[16, -3.0], [18, -1.75], [20, -0.6], [22, 0.45], [24, 1.22], [25, 1.52], [26, 1.84], [27, 2.16], [28, 2.475], [29, 2.776]]
+    [
+        [16, -3.0], [18, -1.75], [20, -0.6], [22, 0.45], [24, 1.22],
+        [25, 1.52], [26, 1.84], [27, 2.16], [28, 2.475], [29, 2.776],
+    ]
 )  # fmt: skip
 """r (AB) against log10 of the galaxies a square arcminute brighter than it: SDSS, HSC and HUDF counts, scaled to the
 paper's 2.15 million a square degree at r < 29."""
-STAR_COUNTS = np.array([[14, -1.4], [16, -0.9], [18, -0.55], [20, -0.2], [22, 0.05], [24, 0.25], [26, 0.42], [29, 0.598]])
+STAR_COUNTS = np.array(
+    [[14, -1.4], [16, -0.9], [18, -0.55], [20, -0.2], [22, 0.05], [24, 0.25], [26, 0.42], [29, 0.598]]
+)
 """The same for stars at high Galactic latitude, scaled to the paper's 218,080 over 15.3 square degrees."""
 MAX_REDSHIFT = 3.0
 SHAPE_NOISE = 0.247
 """Ellipticity dispersion a component (paper: 0.35 in total)."""
 
 
-def galaxies(
-    cell: int, seed: int, density: float, library: SpectrumLibrary, r_band: Bandpass
-) -> pd.DataFrame:
+def galaxies(cell: int, seed: int, density: float, library: SpectrumLibrary, r_band: Bandpass) -> pd.DataFrame:
     """Return the galaxies of one cell, without fluxes; `density` is galaxies to r < 29 a square arcminute.
 
     Magnitude: the counts above. Redshift: p(z | r) ~ z^2 exp(-z / z0), z0 = 0.0417 r - 0.744 (LSST Science Book, sect.

@@ -1,7 +1,7 @@
 """The tile grid: padded images whose unique inner areas cover the sky once; the border rule of every image product.
 
-Rings of constant declination, each cut at steps of right ascension (Troxel et al. 2023, section 4.4): with h half the side
-of the inner area, dec_j = -90 + (2j + 1) h and ra_i = (2i + 1) h / cos(dec_j).
+Rings of constant declination, each cut at steps of right ascension (Troxel et al. 2023, section 4.4): with h half
+the side of the inner area, dec_j = -90 + (2j + 1) h and ra_i = (2i + 1) h / cos(dec_j).
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ class TileGrid:
         bend = self.inner / 2 * np.radians(self.inner / 7200) * np.tan(np.radians(min(edge, 89.999)))
         if excess + bend > self.overlap:
             raise UserError(
-                f"region reaches declination {np.copysign(centre, ring - self._rings / 2):.2f}: tiles {self.inner:.0f} arcsec "
-                f"wide need an overlap of {excess + bend:.1f} arcsec there, coadds.overlap gives "
+                f"region reaches declination {np.copysign(centre, ring - self._rings / 2):.2f}: tiles {self.inner:.0f} "
+                f"arcsec wide need an overlap of {excess + bend:.1f} arcsec there, coadds.overlap gives "
                 f"{self.overlap:.1f}: raise coadds.overlap or lower coadds.pixels"
             )
 

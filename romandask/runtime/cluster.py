@@ -11,7 +11,7 @@ import socket
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -113,7 +113,6 @@ class OnCluster:
             if futures:
                 self._client.cancel(list(futures), force=True)
 
-
     def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
         """Return the next task that ends; UserError where no worker is left for a minute to end one."""
         alone_since: float | None = None
@@ -159,7 +158,9 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         try:
             client = Client(scheduler, timeout="20s")
         except (OSError, ValueError, TimeoutError) as error:
-            raise UserError(f"--scheduler {scheduler}: no dask scheduler answers there ({type(error).__name__})") from None
+            raise UserError(
+                f"--scheduler {scheduler}: no dask scheduler answers there ({type(error).__name__})"
+            ) from None
         with client:
             yield OnCluster(client, f"cluster at {scheduler}, dashboard {client.dashboard_link}")
         return
@@ -168,15 +169,19 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         "distributed.worker.memory.target": False,
         "distributed.admin.large-graph-warning-threshold": "100MB",
     }
-    with dask.config.set(quiet), LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        dashboard_address=f"127.0.0.1:{_free_port(8787)}",
-        memory_limit=int(memory_limit * 2**30),
-        silence_logs=50,
-    ) as cluster, Client(cluster) as client:
+    with (
+        dask.config.set(quiet),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=f"127.0.0.1:{_free_port(8787)}",
+            memory_limit=int(memory_limit * 2**30),
+            silence_logs=50,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
         yield OnCluster(client, f"{workers} local workers, dashboard {cluster.dashboard_link}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from hats.catalog import TableProperties
+from hats.catalog import CatalogType, TableProperties
 from hats.pixel_math.spatial_index import SPATIAL_INDEX_COLUMN, compute_spatial_index
 
 from romandask.runtime.manifest import read_record
@@ -16,7 +16,9 @@ from romandask.runtime.store import Store, write_bytes
 def with_spatial_index(frame: pd.DataFrame, ra: str = "ra", dec: str = "dec") -> pd.DataFrame:
     """Return the rows sorted by, and with, their HEALPix cell of order 29."""
     index = compute_spatial_index(frame[ra].to_numpy(float), frame[dec].to_numpy(float))
-    return frame.assign(**{SPATIAL_INDEX_COLUMN: index}).sort_values(SPATIAL_INDEX_COLUMN, kind="stable", ignore_index=True)
+    return frame.assign(**{SPATIAL_INDEX_COLUMN: index}).sort_values(
+        SPATIAL_INDEX_COLUMN, kind="stable", ignore_index=True
+    )
 
 
 def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec: str = "dec") -> None:
@@ -46,17 +48,17 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
         else:
             content.write_metadata_file(sink)
         write_bytes(root / "dataset" / name, sink.getvalue().to_pybytes())
-    properties = TableProperties(
-        catalog_name=product.stage.replace("/", "_"),
-        catalog_type="object",
-        total_rows=rows,
-        ra_column=ra,
-        dec_column=dec,
-        healpix_column=SPATIAL_INDEX_COLUMN,
-        healpix_order=29,
-        hats_order=product.order,
+    # validated from a mapping: the model's own signature does not tell its optional fields
+    content = dict(
+        obs_collection=product.stage.replace("/", "_"),
+        dataproduct_type=CatalogType.OBJECT,
+        hats_nrows=rows,
+        hats_col_ra=ra,
+        hats_col_dec=dec,
+        hats_col_healpix=SPATIAL_INDEX_COLUMN,
+        hats_col_healpix_order=29,
     )
-    properties.to_properties_file(root)
+    TableProperties.model_validate(content).to_properties_file(root)
 
 
 def _drop_strays(product: TableProduct, store: Store, present: set[int]) -> None:

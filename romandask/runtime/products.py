@@ -1,4 +1,4 @@
-"""Products: lazy images and tables over units, which read a unit from the store where it is and make it where it is not."""
+"""Products: lazy images and tables over units, each read from the store where it is and made where it is not."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ImageProduct:
             group = zarr.open_group(self.store.images(self.stage), mode="r")
             place = np.unravel_index(index, self.lengths)
             wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
-            return {name: group[name][place] for name in wanted}  # type: ignore[index]
+            return {name: _array(group, name)[place] for name in wanted}
         return self.make(index)
 
     def prepare(self, store: Store) -> None:
@@ -99,7 +99,7 @@ class ImageProduct:
                     f"{self.stage} {self.units[index].name}: {variable.name} has shape {array.shape}, expected "
                     f"{variable.shape}, or values that are not finite"
                 )
-            group[variable.name][place] = array.astype(variable.dtype, copy=False)  # type: ignore[index]
+            _array(group, variable.name)[place] = array.astype(variable.dtype, copy=False)
         ordered = [arrays[variable.name] for variable in self.variables]
         return Made(digest(*ordered), sum(array.nbytes for array in ordered), ordered[0].size)
 
@@ -110,7 +110,8 @@ class ImageProduct:
         name = f"{self.stage.replace('/', '-')}-" + digest([unit.settings for unit in self.units])
         source = dask.delayed(self, name=f"{name}-product", traverse=False)
         bundles = da.map_blocks(
-            _load_block, source, self.lengths, chunks=chunks, dtype=object, name=f"{name}-unit", meta=np.empty((0,) * len(chunks), object)
+            _load_block, source, self.lengths, chunks=chunks, dtype=object, name=f"{name}-unit",
+            meta=np.empty((0,) * len(chunks), object),
         )  # fmt: skip
         data = {}
         for variable in self.variables:
@@ -133,6 +134,12 @@ class ImageProduct:
             for key, (axes, values, attributes) in self.coordinates.items()
         }
         return xr.Dataset(data, coordinates, self.attributes)
+
+
+def _array(group: zarr.Group, name: str) -> Any:
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array
 
 
 def _load_block(product: ImageProduct, lengths: tuple[int, ...], block_id: tuple[int, ...] = ()) -> np.ndarray:

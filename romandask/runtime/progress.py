@@ -36,7 +36,8 @@ class Reporter:
         """Show the progress of a stage."""
         if self.console.is_terminal:
             columns = (
-                TextColumn("{task.description:18s}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+                TextColumn("{task.description:18s}"), BarColumn(), MofNCompleteColumn(),
+                TimeElapsedColumn(), TimeRemainingColumn(),
             )  # fmt: skip
             with Progress(*columns, console=self.console) as progress:
                 yield _Bar(progress, name, units)

@@ -81,7 +81,9 @@ class Store:
             probe.write_bytes(b"")
             probe.unlink()
         except OSError as error:
-            raise UserError(f"{self.root}: the store cannot be written ({error.strerror}): choose another --store") from None
+            raise UserError(
+                f"{self.root}: the store cannot be written ({error.strerror}): choose another --store"
+            ) from None
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -1,0 +1,62 @@
+"""A user's mistake is one line, exit code 2, and nothing written."""
+
+import pytest
+from conftest import command
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "tiny", "--store", "s", "coadds.pixfrak=0.8"], ["tiny", "coadds.pixfrak", "coadds.pixfrac"]),
+        (["run", "nowhere.yaml", "--store", "s"], ["nowhere.yaml", "no such pipeline", "tiny"]),
+        (["run", "dc2_sample", "--store", "s", "data=nowhere"], ["nowhere/skycatalogs_sample", "data=FOLDER"]),
+        (
+            ["run", "tiny", "--store", "s", "roman.pointings={source: obseq, path: cut.fits}"],
+            ["cut.fits", "not a complete FITS table"],
+        ),
+        (
+            ["run", "tiny", "--store", "s", "roman.pointings={source: obseq, path: none.fits}"],
+            ["none.fits", "no such file"],
+        ),
+        (["run", "tiny", "--store", "s", "roman.pointings={source: obseq}"], ["roman.pointings.path"]),
+        (["run", "tiny", "--store", "file/s"], ["file/s", "cannot be written", "--store"]),
+        (
+            ["run", "tiny", "--store", "s", "--scheduler", "tcp://127.0.0.1:1"],
+            ["tcp://127.0.0.1:1", "no dask scheduler"],
+        ),
+        (["run", "tiny", "--store", "s", "coadds.pixels=12000"], ["GiB", "coadds.pixels", "run.memory_limit"]),
+        (["plan", "tiny", "coadds.pixfrac=3"], ["coadds.pixfrac", "3"]),
+        (["status", "s"], ["s: not a romandask store"]),
+        (["report", "s"], ["s: not a romandask store"]),
+        (["ingest", "skycatalogs", "nowhere", "--store", "s"], ["nowhere", "no such folder"]),
+    ],
+)
+def test_a_mistake_is_one_line_with_exit_code_2_and_nothing_written(tmp_path, arguments, words):
+    (tmp_path / "cut.fits").write_bytes(b"SIMPLE  =                    T" + b" " * 500)
+    (tmp_path / "file").write_text("")
+    before = sorted(tmp_path.iterdir())
+    done = command(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0]
+    if "--scheduler" not in arguments:
+        assert sorted(tmp_path.iterdir()) == before
+
+
+def test_plan_names_every_stage_and_writes_only_the_picture(tmp_path):
+    done = command("plan", "tiny", "--dag", "dag.svg", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for stage in ("truth/galaxies", "exposures/roman", "coadds/rubin", "matches/groups", "statistics/blends"):
+        assert stage in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["dag.svg"]
+    assert "coadds" in (tmp_path / "dag.svg").read_text() or (tmp_path / "dag.svg").stat().st_size > 5000
+
+
+def test_ingest_accounts_for_every_row(shared, tmp_path):
+    done = command("ingest", "skycatalogs", str(shared / "skycatalogs_sample"), "--store", "s", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "rows in 4987 = rows out" in done.stdout
+    assert (tmp_path / "s" / "truth" / "galaxies" / "hats.properties").is_file()

@@ -1,0 +1,117 @@
+"""The code's own rules: linter, types, layers, and prose that names real things."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import ROOT
+
+PACKAGE = ROOT / "romandask"
+LAYERS = [
+    {"cli"},
+    {"report"},
+    {"pictures", "flow"},
+    {"survey"},
+    {"pipeline", "statistics"},
+    {"matches", "detections"},
+    {"coadds"},
+    {"exposures"},
+    {"pointings", "truth"},
+    {"instruments", "formats", "runtime"},
+    {"kernels"},
+    {"model"},
+]
+"""From the top; a module imports only from below its own layer, or from inside its own folder."""
+
+
+def layer_of(module: str) -> int:
+    top = module.split(".")[1] if "." in module else "romandask"
+    return next((k for k, names in enumerate(LAYERS) if top in names), -1)
+
+
+def imports_of(path: Path) -> list[str]:
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("romandask"):
+            found += [
+                f"{node.module}.{name.name}" if node.module == "romandask" else node.module for name in node.names
+            ]
+        elif isinstance(node, ast.Import):
+            found += [name.name for name in node.names if name.name.startswith("romandask")]
+    return found
+
+
+def modules() -> list[Path]:
+    return [path for path in sorted(PACKAGE.rglob("*.py")) if path.name != "__init__.py" or path.parent != PACKAGE]
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    own = "romandask." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    assert layer_of(own) >= 0, f"{own} has no layer"
+    for module in imports_of(path):
+        inside = module.split(".")[1] == own.split(".")[1] and path.parent != PACKAGE
+        assert inside or layer_of(module) > layer_of(own), f"{own} imports {module}"
+
+
+def test_kernels_and_model_know_no_dask_zarr_or_files():
+    for path in [*(PACKAGE / "kernels").glob("*.py"), *(PACKAGE / "model").glob("*.py")]:
+        text = path.read_text()
+        assert not re.search(r"^(import|from) (dask|distributed|zarr|xarray|pyarrow)", text, re.M), path
+
+
+def test_only_the_cluster_knows_distributed():
+    users = [
+        path.name
+        for path in PACKAGE.rglob("*.py")
+        if re.search(r"^\s*(import|from) distributed", path.read_text(), re.M)
+    ]
+    assert users == ["cluster.py"]
+
+
+def test_modules_read_alone():
+    for path in PACKAGE.rglob("*.py"):
+        assert len(path.read_text().splitlines()) <= 420, path
+        assert ast.get_docstring(ast.parse(path.read_text())), path
+
+
+def test_ruff_finds_nothing():
+    done = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_types_hold_in_model_and_runtime():
+    command = [sys.executable, "-m", "mypy", "romandask/model", "romandask/runtime"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_every_path_and_command_that_the_readme_names_exists():
+    text = (ROOT / "README.md").read_text()
+    for path in re.findall(r"`((?:romandask|pipelines|catalogs|tests)/[\w./-]*)`", text):
+        assert (ROOT / path).exists(), path
+    for name in re.findall(
+        r"romandask (plan|run|status|report|ingest|\w+) ", " ".join(re.findall(r"^romandask .*$", text, re.M))
+    ):
+        assert name in {"plan", "run", "status", "report", "ingest"}
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    run, test = (block.strip().splitlines()[0] for block in blocks[:2])
+    assert "romandask run pipelines/tiny.yaml --store runs/tiny" in run
+    assert test in (ROOT / ".ci" / "run").read_text()
+
+
+def test_every_catalog_column_is_described():
+    for path in (ROOT / "catalogs").glob("*.yaml"):
+        content = yaml.safe_load(path.read_text())
+        assert {"description", "key", "partitioning", "columns"} <= set(content), path
+        for column in content["columns"]:
+            assert {"name", "dtype", "unit", "ucd", "description"} <= set(column), (path, column)

@@ -1,0 +1,137 @@
+"""Runs: the same bytes whatever the workers and whatever was killed; only what changed is made again."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import MINI, command
+
+STAGES = (
+    "truth/galaxies",
+    "exposures/roman",
+    "coadds/roman",
+    "coadds/rubin",
+    "objects/roman",
+    "matches/groups",
+    "statistics/blends",
+)
+
+
+def outputs(store: Path) -> dict[str, str]:
+    """Content hash of every unit, from the manifest."""
+    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
+    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
+
+
+def products(store: Path) -> dict[str, bytes]:
+    """Bytes of every file of the products: not the manifest (times), the report or the stored settings."""
+    skipped = ("manifest", "report", "pipeline.yaml", "versions.json", ".lock")
+    paths = [path for path in store.rglob("*") if path.is_file() and path.relative_to(store).parts[0] not in skipped]
+    texts = {"zarr.json", "hats.properties"}
+    return {str(path.relative_to(store)): path.read_bytes() for path in paths if path.name not in texts}
+
+
+@pytest.fixture(scope="module")
+def one_worker(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    done = command("run", "tiny", "--store", "s", "--workers", "1", *MINI, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "dashboard http://127.0.0.1:" in done.stdout
+    found = outputs(folder / "s")
+    assert all(any(name.startswith(stage) for name in found) for stage in STAGES)
+    return folder / "s"
+
+
+def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_path):
+    """Started with two workers, killed with SIGKILL once exposures exist, then the same command again."""
+    arguments = [sys.executable, "-m", "romandask.cli", "run", "tiny", "--store", "s", "--workers", "2", *MINI]
+    driver = subprocess.Popen(arguments, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    manifest = tmp_path / "s" / "manifest" / "exposures" / "roman"
+    deadline = time.monotonic() + 240
+    while not list(manifest.glob("*.json")):
+        assert time.monotonic() < deadline
+        assert driver.poll() is None
+        time.sleep(0.1)
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.wait()
+    before = {name for name in outputs(tmp_path / "s") if name.startswith(("truth", "pointings"))}
+    done = command("run", "tiny", "--store", "s", "--workers", "2", *MINI, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert before
+    assert int(done.stdout.split("kept ")[1].split(",")[0]) >= len(before)
+    assert outputs(tmp_path / "s") == outputs(one_worker)
+    assert products(tmp_path / "s") == products(one_worker)
+
+
+def test_a_rerun_has_nothing_to_do_and_a_changed_setting_makes_only_what_depends_on_it(one_worker):
+    again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    assert again.returncode == 0, again.stderr
+    assert "nothing to do" in again.stdout
+    kept = {path: path.stat().st_mtime_ns for path in (one_worker / "manifest" / "coadds").rglob("*.json")}
+    before = outputs(one_worker)
+    changed = command(
+        "run", "tiny", "--store", "s", "--workers", "0", *MINI, "detections.min_snr=8", cwd=one_worker.parent
+    )
+    assert changed.returncode == 0, changed.stdout + changed.stderr
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items()), "coadds do not depend on detection"
+    after = outputs(one_worker)
+    assert any(after[name] != value for name, value in before.items() if name.startswith("detections"))
+    back = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    assert back.returncode == 0
+    assert outputs(one_worker) == before
+
+
+def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one_worker):
+    arguments = [sys.executable, "-m", "romandask.cli", "run", "tiny", "--store", "s", "--workers", "1", *MINI]
+    driver = subprocess.Popen(
+        arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 240
+    while not (tmp_path / "s" / "manifest" / "pointings").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    os.kill(driver.pid, signal.SIGINT)
+    _, errors = driver.communicate(timeout=60)
+    assert driver.returncode == 130
+    assert "the same command resumes" in errors
+    assert "Traceback" not in errors
+    assert not (tmp_path / "s" / ".lock").exists()
+    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert outputs(tmp_path / "s") == outputs(one_worker)
+
+
+def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
+    """A truth partition that cannot be read: what needs it is set aside, exit code 1, and the next run mends it."""
+    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    assert done.returncode == 0
+    shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
+    record = next((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.json"))
+    record.unlink()
+    for path in shard.parent.rglob("*"):
+        if path.is_file():
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 0x40
+            path.write_bytes(content)
+    failed = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    assert failed.returncode == 1, failed.stdout
+    assert "failed: coadds/roman/" in failed.stdout
+    assert "Traceback" not in failed.stderr
+    assert list((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed"))
+
+
+def test_status_and_report_of_a_store(one_worker):
+    shown = command("status", str(one_worker))
+    assert shown.returncode == 0
+    assert "exposures/roman" in shown.stdout
+    made = command("report", str(one_worker))
+    assert made.returncode == 0, made.stderr
+    page = (one_worker / "report" / "index.html").read_text()
+    assert page.count("data:image/png;base64,") >= 6
+    assert "http://" not in page
+    assert "https://" not in page

@@ -1,0 +1,141 @@
+"""The tiny survey as its user meets it: served products, owned objects, recovered stars."""
+
+import dask
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from conftest import command
+from scipy.spatial import cKDTree
+
+import romandask as rd
+from romandask.flow import run_figures
+from romandask.model.sky import ARCSEC, unit_vectors
+from romandask.runtime.store import Store
+
+
+@pytest.fixture(scope="module")
+def survey(tiny_store):
+    with dask.config.set(scheduler="synchronous"):
+        yield rd.open(tiny_store)
+
+
+@pytest.fixture(scope="module")
+def truth(survey):
+    galaxies, stars = survey.truth("galaxies").compute(), survey.truth("stars").compute()
+    return pd.concat([galaxies.assign(star=False), stars.assign(star=True)], ignore_index=True)
+
+
+def test_a_rerun_finds_nothing_to_do(tiny_store):
+    done = command("run", "tiny", "--store", "tiny", cwd=tiny_store.parent)
+    assert done.returncode == 0
+    assert "nothing to do" in done.stdout
+
+
+def test_products_are_served_with_units(survey):
+    coadds = survey.coadds("roman")
+    assert dict(coadds["image"].sizes) == {"tile": 2, "band": 4, "y": 1000, "x": 1000}
+    one = coadds.sel(band="H158").isel(tile=0)
+    assert one["image"].attrs["units"] == "nJy"
+    assert one["nimages"].max().compute() >= 5
+    exposures = survey.exposures("roman")
+    assert exposures["image"].chunks[0] == (1,) * exposures.sizes["exposure"]
+    assert "coadds/roman" in repr(survey)
+    assert survey.objects("rubin").columns.str.contains("i_psfFlux").any()
+
+
+def test_the_stores_images_open_with_xarray_alone(tiny_store):
+    dataset = xr.open_zarr(tiny_store / "coadds" / "rubin.zarr", consolidated=False)
+    assert list(dataset["band"].values) == list("ugrizy")
+    assert float(np.abs(dataset["image"].sel(band="i").isel(tile=0)).max()) > 0
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_every_object_is_in_one_tile_and_in_the_region(survey, name):
+    objects = survey.objects(name).compute()
+    assert objects["objectId"].is_unique
+    owner = survey.pipeline.coadds.grid().owner(objects["coord_ra"], objects["coord_dec"])
+    names = {tile.id: tile.name for tile in survey.tiles}
+    assert [names[value] for value in owner] == objects["tile"].tolist()
+    assert survey.region.contains(objects["coord_ra"], objects["coord_dec"]).all()
+    detections = survey.detection_product(name).all_rows()
+    assert sorted(detections["objectId"]) == sorted(objects["objectId"])
+
+
+def test_no_object_is_detected_by_two_tiles(survey):
+    objects = survey.objects("roman").compute()
+    first, second = (objects[objects["tile"] == tile.name] for tile in survey.tiles)
+    gap, _ = cKDTree(unit_vectors(first["coord_ra"], first["coord_dec"])).query(
+        unit_vectors(second["coord_ra"], second["coord_dec"])
+    )
+    assert gap.min() / ARCSEC > 0.1
+
+
+def isolated_stars(truth, region, band):
+    """Bright true stars with nothing of a hundredth of their light nearby: (rows, true flux)."""
+    flux = truth[f"flux_{band}"].to_numpy()
+    vectors = unit_vectors(truth["ra"], truth["dec"])
+    chosen = []
+    for row in np.flatnonzero(truth["star"] & region.contains(truth["ra"], truth["dec"], -5.0)):
+        gap = np.linalg.norm(vectors - vectors[row], axis=1) / ARCSEC
+        near = (gap < 3.0) & (gap > 0)
+        if flux[near].sum() < 0.03 * flux[row]:
+            chosen.append(row)
+    return np.array(chosen, int), flux
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_magnitudes_of_isolated_bright_stars_agree_with_truth_in_every_band(survey, truth, name):
+    objects = survey.objects(name).compute()
+    tree = cKDTree(unit_vectors(objects["coord_ra"], objects["coord_dec"]))
+    for band in survey.instruments[name].bands:
+        rows, flux = isolated_stars(truth, survey.region, band)
+        gap, index = tree.query(unit_vectors(truth["ra"].iloc[rows], truth["dec"].iloc[rows]))
+        measured = objects.iloc[np.minimum(index, len(objects) - 1)]
+        value, error = measured[f"{band}_psfFlux"].to_numpy(), measured[f"{band}_psfFluxErr"].to_numpy()
+        bright = (gap / ARCSEC < 0.3) & (value > 30 * error) & (flux[rows] < 3e5)
+        assert bright.sum() >= 1, f"{band}: no isolated bright star"
+        difference = -2.5 * np.log10(value[bright] / flux[rows][bright])
+        # faint neighbours and the coadd's PSF taken at the tile's centre leave two per cent besides the noise
+        sigma = np.hypot(1.0857 * error[bright] / value[bright], 0.02)
+        assert (np.abs(difference) < 3 * sigma).all(), (band, difference, sigma)
+
+
+@pytest.mark.parametrize(("name", "limit"), [("roman", 0.05 * 0.0575), ("rubin", 0.05 * 0.2)])
+def test_positions_of_isolated_stars_agree_to_a_twentieth_of_a_pixel(survey, truth, name, limit):
+    objects = survey.objects(name).compute()
+    band = {"roman": "H158", "rubin": "i"}[name]
+    rows, flux = isolated_stars(truth, survey.region, band)
+    rows = rows[(flux[rows] > 3000) & (flux[rows] < 3e5)]
+    ra, dec = truth["ra"].to_numpy()[rows], truth["dec"].to_numpy()[rows]
+    gap, _ = cKDTree(unit_vectors(objects["coord_ra"], objects["coord_dec"])).query(unit_vectors(ra, dec))
+    assert len(rows) >= 1
+    assert np.median(gap / ARCSEC) < max(limit, 0.004)
+
+
+def test_noise_realisations_have_the_noise_of_the_images(survey):
+    """Away from objects, image and noise have the same scatter: half the pixels of a Roman tile are that faint."""
+    for name, band in (("roman", "F184"), ("rubin", "u")):
+        tile = survey.coadds(name).sel(band=band).isel(tile=0)
+        image, noise = tile["image"].values, tile["noise"].values
+        low = image < np.median(image)
+        below = np.sqrt(np.mean((image[low] - np.median(image)) ** 2))
+        assert below == pytest.approx(noise.std(), rel=0.08)
+
+
+def test_groups_hold_every_object_and_the_matrix_counts_them(survey):
+    groups = survey.matches().compute()
+    counts = {name: len(survey.objects(name)) for name in ("roman", "rubin")}
+    assert groups["survey"].value_counts().to_dict() == counts
+    for length in (1.0, 0.5):
+        matrix = survey.statistics.blends(length)
+        assert (matrix.sum(axis=1) * matrix.index).sum() == counts["roman"]
+        assert (matrix.sum(axis=0) * matrix.columns).sum() == counts["rubin"]
+    with pytest.raises(rd.UserError, match="linking length"):
+        survey.statistics.blends(3.0)
+    with pytest.raises(rd.UserError, match="roman, rubin"):
+        survey.objects("euclid")
+
+
+def test_workers_lived_within_their_memory(tiny_store):
+    assert max(row["peak_bytes"] for row in run_figures(Store(tiny_store))) < 2 * 2**30

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +15,6 @@ from typing import Annotated
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import click  # noqa: E402
 import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
@@ -26,7 +28,12 @@ from romandask.runtime.progress import Reporter  # noqa: E402
 from romandask.runtime.store import Store  # noqa: E402
 from romandask.survey import Survey, open_survey  # noqa: E402
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="A joint Roman and Rubin synthetic sky survey.")
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    help="A joint Roman and Rubin synthetic sky survey.",
+)
 ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
 app.add_typer(ingest_app, name="ingest")
 
@@ -82,7 +89,7 @@ def run(
     place.prepare()
     start = time.monotonic()
     count = settings.run.workers if workers is None else workers
-    with runner(count, settings.run.memory_limit, scheduler) as execution:
+    with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
         reporter.say(f"{settings.name}: {execution.description}")
         summary = flow.run(settings, place, execution, reporter)
     made, kept = sum(summary.made.values()), sum(summary.kept.values())
@@ -144,25 +151,30 @@ def skycatalogs(
     survey.truth_catalogs  # noqa: B018  opened, so that a wrong source is known before anything is written
     place.prepare()
     reporter = Reporter(Console())
-    with runner(workers or 0, settings.run.memory_limit) as execution:
+    with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
         counts = flow.ingest(settings, place, execution, reporter)
     reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")
 
 
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Turn an interrupt into one line: what is stored stays, and the same command goes on from there."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("stopped; the same command resumes", file=sys.stderr)
+        raise typer.Exit(130) from None
+
+
 def main() -> None:
     """Run the command line."""
+    # when several chunks of a damaged file fail at once, asyncio logs all but the one that is raised
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     try:
-        code = app(standalone_mode=False)
+        app()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        code = 2
-    except click.ClickException as error:
-        error.show()
-        code = error.exit_code
-    except (KeyboardInterrupt, click.Abort):
-        print("stopped; the same command resumes", file=sys.stderr)
-        code = 130
-    sys.exit(code)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

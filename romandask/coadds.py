@@ -32,6 +32,8 @@ from romandask.runtime.store import Variable
 
 PSF_RADIUS = 3.0
 """Half the side of the PSF images, arcsec, for a pixel of 0.0575 arcsec; larger pixels get larger images."""
+PSF_PHASES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+"""Where in a native pixel the stars of the PSF image lie: undersampled, an image of a star depends on it."""
 BACKGROUND_MESH = 256
 """Pixels of the mesh on which an exposure's background is estimated."""
 
@@ -256,20 +258,21 @@ def _star(basis: PsfBasis, bandpass: Bandpass, side: int, offset: tuple[float, f
 
 
 def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, tile: Tile, side: int) -> None:
-    """Drizzle a unit star, as the exposure sees it as near as it can to the tile's centre, onto the PSF image."""
+    """Drizzle unit stars, as the exposure sees them as near as it can to the tile's centre, onto the PSF image."""
     ny, nx = instrument.shape
     at = np.array(wcs.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float)
     # a stamp at any roll covers the corners of the PSF image
     half = int(np.ceil(1.5 * side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 2
-    x, y = np.clip(at, half + 1, [nx - half - 2, ny - half - 2])
-    column, row = int(round(x)), int(round(y))
-    star = _star(instrument.psf(exposure, 256), instrument.bandpass(exposure.band), 2 * half + 1, (x - column, y - row))
-    ra, dec = wcs.all_pix2world(x, y, 0)
-    target = WCS(tangent_header(float(ra), float(dec), side, instrument.coadd_scale))
+    column, row = np.rint(np.clip(at, half + 1, [nx - half - 2, ny - half - 2])).astype(int)
     rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-    area = pixel_areas_at(wcs, x, y)
-    weight = np.full(star.shape, exposure.exptime, np.float32)
-    psf.add([([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))])
+    basis, bandpass = instrument.psf(exposure, 256), instrument.bandpass(exposure.band)
+    area = pixel_areas_at(wcs, float(column), float(row))
+    for offset in PSF_PHASES:
+        star = _star(basis, bandpass, 2 * half + 1, offset)
+        ra, dec = wcs.all_pix2world(column + offset[0], row + offset[1], 0)
+        target = WCS(tangent_header(float(ra), float(dec), side, instrument.coadd_scale))
+        weight = np.full(star.shape, exposure.exptime, np.float32)
+        psf.add([([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))])
 
 
 def pixel_areas_at(wcs: WCS, x: float, y: float) -> float:

@@ -14,6 +14,7 @@ from romandask.instruments.exposure import Instrument
 from romandask.kernels.extract import (
     Found,
     Layer,
+    aperture_fluxes,
     detect,
     kron_fluxes,
     mean_layer,
@@ -45,7 +46,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     bands = instrument.bands
     state = {
         "settings": settings.model_dump(exclude={"order"}), "bands": bands, "region": vars(region),
-        "kind": instrument.detection, "extended": EXTENDED,
+        "kind": instrument.detection, "extended": EXTENDED, "aperture": instrument.aperture,
     }  # fmt: skip
     units = tuple(
         Unit(tile.name, {**state, "tile": tile.name}, tuple((coadds.stage, f"{tile.name}-{band}") for band in bands))
@@ -120,7 +121,7 @@ class DetectTile:
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region) & (found.snr >= settings.min_snr)
         radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
-        return measure(select(found, keep), ra[keep], dec[keep], tile, layers, instrument.coadd_scale, radius)
+        return measure(select(found, keep), ra[keep], dec[keep], tile, layers, instrument, radius)
 
 
 def load_layer(coadds: ImageProduct, instrument: Instrument, tile: int, position: int, band: str) -> Layer:
@@ -137,9 +138,16 @@ def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: R
 
 
 def measure(
-    found: Found, ra: np.ndarray, dec: np.ndarray, tile: Tile, layers: dict[str, Layer], scale: float, psf_radius: float
+    found: Found,
+    ra: np.ndarray,
+    dec: np.ndarray,
+    tile: Tile,
+    layers: dict[str, Layer],
+    instrument: Instrument,
+    psf_radius: float,
 ) -> pd.DataFrame:
     """Return the object table of some detections: positions, shapes, fluxes in every band."""
+    scale = instrument.coadd_scale
     ring, column = divmod(tile.id, 1 << 32)
     number = ((ring << 18) + column << 24) + np.arange(len(found.x), dtype=np.int64)
     flags = found.flags.copy()
@@ -162,6 +170,9 @@ def measure(
         flux, error, flag = kron_fluxes(layer, found)
         flags |= flag.astype(np.int32)
         columns[f"{band}_kronFlux"], columns[f"{band}_kronFluxErr"] = flux, error
+        columns[f"{band}_apFlux"], columns[f"{band}_apFluxErr"] = aperture_fluxes(
+            layer, found, instrument.aperture / scale
+        )
         columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(layer, found)
     frame = pd.DataFrame(columns | {"flags": flags})
     return with_spatial_index(frame, "coord_ra", "coord_dec")

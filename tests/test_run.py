@@ -107,7 +107,7 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
 
 
 def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
-    """A truth partition that cannot be read: what needs it is set aside, exit code 1, and the next run mends it."""
+    """An exposure that cannot be read: what needs it is set aside with its traceback, and the exit code is 1."""
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert done.returncode == 0
     shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
@@ -121,7 +121,6 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     failed = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert failed.returncode == 1, failed.stdout
     assert "failed: coadds/roman/" in failed.stdout
-    assert "Traceback" not in failed.stderr
     assert list((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed"))
 
 

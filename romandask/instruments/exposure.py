@@ -69,6 +69,8 @@ class Instrument(Protocol):
     knot_smoothing: float
     """Sigma, arcsec, of the Gaussian that smooths knots of galaxies."""
     detector: Detector
+    aperture: float
+    """Radius of aperture photometry, arcsec: it holds most of the light of a point source."""
     detection: Literal["median", "mean"]
     """How bands are combined to the detection image."""
     detection_bands: tuple[str, ...] | None

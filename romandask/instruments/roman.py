@@ -80,6 +80,7 @@ class Roman:
     shape: tuple[int, int] = (SIDE, SIDE)
     field_radius: float = 0.6
     knot_smoothing: float = KNOT_SMOOTHING
+    aperture: float = 0.5
     detection: Literal["median", "mean"] = "median"
     detection_bands: tuple[str, ...] | None = None
     coadd_from: Literal["exposures", "pointings"] = "exposures"

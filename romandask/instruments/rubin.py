@@ -71,6 +71,7 @@ class Rubin:
     shape: tuple[int, int] = (4000, 4072)
     field_radius: float = 1.9
     knot_smoothing: float = 0.0
+    aperture: float = 1.5
     detection: Literal["median", "mean"] = "mean"
     detection_bands: tuple[str, ...] | None = None
     coadd_from: Literal["exposures", "pointings"] = "pointings"

@@ -199,6 +199,24 @@ def noise_ratios(layer: Layer, error: np.ndarray) -> np.ndarray:
     return ratios
 
 
+def aperture_fluxes(layer: Layer, found: Found, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return flux and error of every object in a circle (pixels), corrected to the total light of a point source.
+
+    The correction is the share of the PSF image's light inside the circle; no detail of the PSF within it matters.
+    """
+    if not len(found.x):
+        return np.empty(0), np.empty(0)
+    middle = (layer.psf.shape[0] - 1) / 2
+    psf = np.ascontiguousarray(layer.psf, dtype=np.float32)
+    share = float(sep.sum_circle(psf, [middle], [middle], radius, subpix=5)[0][0])
+    error, mask = layer.error(), layer.weight <= 0
+    flux, white, _ = sep.sum_circle(layer.image, found.x, found.y, radius, err=error, mask=mask, subpix=5)
+    ratio = np.interp(radius, _NOISE_RADII, noise_ratios(layer, error))
+    if not share > 0:
+        return np.full(len(flux), np.nan), np.full(len(flux), np.nan)
+    return flux / share, np.sqrt((white * ratio) ** 2 + layer.poisson(flux, found.x, found.y)) / share
+
+
 def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and error of every object as a point source: unweighted fit of the PSF in a window."""
     error = layer.error()

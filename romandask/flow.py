@@ -136,9 +136,7 @@ def run(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) ->
     """Make and store, in order, what is missing or no longer what the pipeline asks for."""
     summary = Summary()
     with locked(store.root):
-        write_bytes(store.pipeline, pipeline.to_yaml().encode())
-        write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
-        survey = Survey(pipeline, store)
+        survey = _begin(pipeline, store)
         for stage in stages(survey):
             _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
     return summary
@@ -154,9 +152,7 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     """
     summary = Summary()
     with locked(store.root):
-        write_bytes(store.pipeline, pipeline.to_yaml().encode())
-        write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
-        survey = Survey(pipeline, store)
+        survey = _begin(pipeline, store)
         for stage in stages(survey):
             if stage.name.startswith("truth/"):
                 _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
@@ -166,6 +162,13 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     if summary.failed or counts["in"] != counts["out"] + counts["quarantined"]:
         raise RuntimeError(f"rows are missing: {counts}; failed units: {summary.failed}")
     return counts
+
+
+def _begin(pipeline: Pipeline, store: Store) -> Survey:
+    """Store the resolved settings and the packages' versions, and return the survey."""
+    write_bytes(store.pipeline, pipeline.to_yaml().encode())
+    write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
+    return Survey(pipeline, store)
 
 
 def _run_stage(

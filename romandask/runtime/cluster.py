@@ -168,6 +168,8 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.target": False,
         "distributed.admin.large-graph-warning-threshold": "100MB",
+        # the threads that decode chunks would each keep a heap of their own, and a worker twice what it uses
+        "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2,
     }
     with (
         dask.config.set(quiet),

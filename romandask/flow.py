@@ -20,6 +20,7 @@ from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store, write_bytes, write_json
 from romandask.runtime.work import Task
 from romandask.survey import Survey
+from romandask.truth import write_spectra
 
 Product = ImageProduct | TableProduct
 INTERPRETER = 420 << 20
@@ -165,10 +166,12 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
 
 
 def _begin(pipeline: Pipeline, store: Store) -> Survey:
-    """Store the resolved settings and the packages' versions, and return the survey."""
+    """Store the resolved settings, the packages' versions and the library of spectra, and return the survey."""
     write_bytes(store.pipeline, pipeline.to_yaml().encode())
     write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
-    return Survey(pipeline, store)
+    survey = Survey(pipeline, store)
+    write_spectra(survey.truth_catalogs, store)
+    return survey
 
 
 def _run_stage(

@@ -94,7 +94,8 @@ def size_magnitude(objects: dict[str, pd.DataFrame], bands: dict[str, str]) -> b
         extended = frame["extendedness"].to_numpy() > 0
         for chosen, colour, name in ((extended, "0.5", "extended"), (~extended, "tab:red", "point-like")):
             axes.scatter(magnitude[chosen], frame["half_light_radius"][chosen], s=7, color=colour, label=name)
-        axes.set_yscale("log")
+        if len(frame):
+            axes.set_yscale("log")
         axes.set_xlabel(f"{survey} {bands[survey]}, Kron AB mag")
         axes.set_ylabel("half-light radius, arcsec")
         axes.legend(fontsize=8)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import zarr
 
 from romandask.formats import skycatalogs
 from romandask.formats import spectra as spectra_files
@@ -22,6 +23,7 @@ from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, T
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.products import TableProduct, Unit
 from romandask.runtime.schemas import schema
+from romandask.runtime.store import Store, write_coordinate
 
 WIDE = 1e7
 """Square arcminutes above which the cells of a region are not listed one by one."""
@@ -137,6 +139,20 @@ def truth(
         schema("quarantine"),
     )
     return TruthCatalogs(table("galaxies"), table("stars"), quarantine, library, edges, frame, rows)
+
+
+def write_spectra(catalogs: TruthCatalogs, store: Store) -> None:
+    """Write truth/seds.zarr: the library that the catalogs' `*_sed` columns index, and the edges of top-hat bins."""
+    group = zarr.open_group(store.images("truth/seds"), mode="a")
+    library = catalogs.library
+    write_coordinate(group, "wave", library.wave, ("wave",), {"units": "nm", "long_name": "rest-frame wavelength"})
+    text = {"long_name": "photon density over that at 500 nm"}
+    write_coordinate(group, "photons", library.photons, ("sed", "wave"), text)
+    if library.names:
+        write_coordinate(group, "sed", np.array(library.names, object), ("sed",), {"long_name": "name"})
+    if catalogs.edges:
+        text = {"units": "nm", "long_name": "rest-frame edges of the bins of sed_val_*"}
+        write_coordinate(group, "tophat_edges", np.array(catalogs.edges), ("edge",), text)
 
 
 def bind(

@@ -1,5 +1,6 @@
 """A user's mistake is one line, exit code 2, and nothing written."""
 
+import pyarrow.parquet as pq
 import pytest
 from conftest import command
 
@@ -44,6 +45,32 @@ def test_a_mistake_is_one_line_with_exit_code_2_and_nothing_written(tmp_path, ar
         assert word in lines[0]
     if "--scheduler" not in arguments:
         assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_region_without_pointings_and_a_catalog_without_a_column(shared, tmp_path):
+    """Both are known before any work starts."""
+    path = "roman_obseq/Roman_WAS_obseq_11_1_23.fits"
+    done = command(
+        "run",
+        "tiny",
+        "--store",
+        "s",
+        f"data={shared}",
+        f"roman.pointings={{source: obseq, path: {path}}}",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2
+    assert "no exposure of roman in Y106" in done.stderr
+    folder = tmp_path / "catalog"
+    folder.mkdir()
+    (folder / "skyCatalog.yaml").write_bytes((shared / "skycatalogs_sample" / "skyCatalog.yaml").read_bytes())
+    table = pq.read_table(shared / "skycatalogs_sample" / "galaxy_9683.parquet").drop_columns(["redshift"])
+    pq.write_table(table, folder / "galaxy_9683.parquet")
+    done = command("ingest", "skycatalogs", "catalog", "--store", "s", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert "galaxy_9683.parquet: column 'redshift' is missing" in done.stderr
+    assert not (tmp_path / "s").exists()
 
 
 def test_plan_names_every_stage_and_writes_only_the_picture(tmp_path):

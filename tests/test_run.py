@@ -134,3 +134,11 @@ def test_status_and_report_of_a_store(one_worker):
     assert page.count("data:image/png;base64,") >= 6
     assert "http://" not in page
     assert "https://" not in page
+
+
+def test_a_survey_that_finds_nothing_still_ends_with_a_report(tmp_path):
+    """An empty universe: no galaxies, no stars, no objects, no groups."""
+    empty = ("truth.galaxies=0", "truth.stars=0", "detections.min_snr=100")
+    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, *empty, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "data:image/png" in (tmp_path / "s" / "report" / "index.html").read_text()

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 import romandask as rd
 from romandask.flow import run_figures
+from romandask.instruments.exposure import exposure_of
 from romandask.model.sky import ARCSEC, unit_vectors
 from romandask.runtime.store import Store
 
@@ -48,6 +49,29 @@ def test_the_stores_images_open_with_xarray_alone(tiny_store):
     dataset = xr.open_zarr(tiny_store / "coadds" / "rubin.zarr", consolidated=False)
     assert list(dataset["band"].values) == list("ugrizy")
     assert float(np.abs(dataset["image"].sel(band="i").isel(tile=0)).max()) > 0
+
+
+def test_the_spectra_that_the_truth_names_are_stored(survey, tiny_store, truth):
+    library = xr.open_zarr(tiny_store / "truth" / "seds.zarr", consolidated=False)
+    used = truth["disk_sed"].dropna().astype(int)
+    assert set(library["sed"].values[used.unique()]) <= {"CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im"}
+    assert library["sed"].values[int(truth["sed"].dropna().iloc[0])].startswith("blackbody_")
+    at_500 = library["photons"].interp(wave=500.0).values
+    np.testing.assert_allclose(at_500, 1.0, rtol=2e-3)
+
+
+def test_single_rubin_exposures_are_there_for_the_asking(survey):
+    """They are not stored where coadds are drawn from the cadence: the image is sky, objects and their noise."""
+    dataset = survey.exposures("rubin").isel(exposure=0)
+    image, truth = dask.compute(dataset["image"], dataset["truth"])
+    exposure = exposure_of(survey.pointings("rubin").iloc[0])
+    rubin = survey.instruments["rubin"]
+    sky = rubin.background(exposure, rubin.header(exposure))
+    pull = (image.values - truth.values - sky) / np.sqrt(
+        np.maximum(truth.values + sky, 1) + rubin.detector.read_noise**2
+    )
+    assert pull.mean() == pytest.approx(0, abs=0.01)
+    assert pull.std() == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.parametrize("name", ["roman", "rubin"])

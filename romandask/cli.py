@@ -85,7 +85,7 @@ def run(
     settings = load_pipeline(pipeline, overrides)
     reporter = Reporter(Console())
     flow.plan(Survey(settings))
-    place = Store(store)
+    place = Store(store.resolve())
     place.prepare()
     start = time.monotonic()
     count = settings.run.workers if workers is None else workers
@@ -146,7 +146,7 @@ def skycatalogs(
         "rubin": {},
     }  # fmt: skip
     settings = pipeline_of(content, str(source))
-    place = Store(store)
+    place = Store(store.resolve())
     survey = Survey(settings)
     survey.truth_catalogs  # noqa: B018  opened, so that a wrong source is known before anything is written
     place.prepare()

@@ -69,7 +69,9 @@ def load_pipeline(source: str | Path, overrides: list[str] | None = None) -> Pip
     """
     path = Path(source)
     content = apply_overrides(read_yaml(_find(path)), overrides or [])
-    return validate(Pipeline, content, str(source))
+    settings: Pipeline = validate(Pipeline, content, str(source))
+    # workers, and whoever opens the store later, need not share this working directory
+    return settings.model_copy(update={"data": str(Path(settings.data).resolve())})
 
 
 def pipeline_of(content: dict[str, Any], source: str) -> Pipeline:

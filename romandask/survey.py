@@ -282,7 +282,7 @@ def open_survey(path: str | Path) -> Survey:
     UserError
         If the folder is not a store.
     """
-    store = Store(Path(path))
+    store = Store(Path(path).resolve())
     if not store.pipeline.is_file():
         raise UserError(f"{path}: not a romandask store (it has no pipeline.yaml); make one with romandask run")
     return Survey(load_pipeline(store.pipeline), store)

@@ -48,6 +48,15 @@ def test_the_interpolated_map_is_exact_to_a_thousandth_of_a_pixel():
         assert np.abs(found[y - 1000, x, plane].ravel() - exact[plane]).max() < 1e-3
 
 
+@pytest.mark.parametrize("rows", [slice(10, 11), slice(299, 300), slice(5, 8)])
+def test_the_map_of_few_rows_is_that_of_many(small, rows):
+    """The last strip of an exposure may be a single row."""
+    source, (target, _) = WCS(small.roman.header(small.exposures[0])), target_of(small)
+    whole = pixel_map(source, target, slice(0, 300), slice(0, 300))
+    np.testing.assert_allclose(pixel_map(source, target, rows, slice(0, 300)), whole[rows], atol=1e-6)
+    np.testing.assert_allclose(pixel_map(source, target, slice(0, 300), rows), whole[:, rows], atol=1e-6)
+
+
 def test_flux_is_conserved_through_distortion_and_roll(small):
     """Stars of known electrons, drawn on the exposure's grid, keep their flux on the tile to a part in a thousand."""
     header = small.roman.header(small.exposures[1])

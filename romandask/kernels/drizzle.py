@@ -108,5 +108,6 @@ def _bounds(values: np.ndarray, length: int) -> slice:
 
 
 def _knots(part: slice) -> np.ndarray:
+    """Return at least four points, the least of a cubic, over some rows or columns; beyond them where they are few."""
     count = max(4, (part.stop - part.start) // GRID + 2)
-    return np.linspace(part.start, part.stop - 1, count)
+    return np.linspace(part.start, max(part.stop - 1, part.start + 3), count)

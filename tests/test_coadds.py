@@ -1,5 +1,6 @@
 """Resampling, and the lazy composition of exposures and coadds."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import dask
@@ -106,6 +107,19 @@ def test_sums_equal_the_drizzle_package_over_whole_images(small):
 def test_an_image_elsewhere_has_no_strips(small):
     source = WCS(small.roman.header(small.exposures[0]))
     assert strips(source, small.roman.shape, WCS(tangent_header(10.0, 20.0, 100, 0.0575)), (100, 100)) == []
+
+
+@pytest.mark.parametrize("pixels", [1000, 1907, 2345, 3400])
+def test_strips_cover_the_part_without_slivers(pixels):
+    """The package refuses a map of a single row, which is what is left of 1025 rows in strips of 512."""
+    source = WCS(Roman(RomanSettings()).header(Exposure(0, 9, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)))
+    ra, dec = source.all_pix2world(2044, 3000, 0)
+    target = WCS(tangent_header(float(ra), float(dec), pixels, 0.0575))
+    found = strips(source, (4088, 4088), target, (pixels, pixels))
+    rows = [part.rows for part in found]
+    assert all(first.stop == second.start for first, second in itertools.pairwise(rows))
+    assert min(part.stop - part.start for part in rows) >= 256
+    assert max(part.stop - part.start for part in rows) <= 768
 
 
 def test_a_small_target_between_the_grid_points_is_found(small):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 GRID = 64
 """Pixels between the points at which the map between two WCSs is computed exactly."""
 STRIP = 512
-"""Rows of a strip."""
+"""Rows of a strip, about."""
 MARGIN = 4
 """Pixels around the part of an exposure that falls on a tile."""
 
@@ -44,8 +45,9 @@ def strips(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple
     u = np.concatenate([np.broadcast_to(xs, on.shape)[on], back[0][inside]])
     v = np.concatenate([np.broadcast_to(ys[:, None], on.shape)[on], back[1][inside]])
     columns, rows = _bounds(u, shape[1]), _bounds(v, shape[0])
-    starts = range(rows.start, rows.stop, STRIP)
-    return [Strip(slice(start, min(start + STRIP, rows.stop)), columns) for start in starts]
+    # of like height: the package refuses a map of a single row
+    edges = np.linspace(rows.start, rows.stop, max(1, round((rows.stop - rows.start) / STRIP)) + 1).astype(int).tolist()
+    return [Strip(slice(low, high), columns) for low, high in itertools.pairwise(edges)]
 
 
 def pixel_map(source: WCS, target: WCS, rows: slice, columns: slice) -> np.ndarray:

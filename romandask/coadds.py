@@ -95,7 +95,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         bytes_per_unit=pixels**2 * (48 if drawn else 33)
         + int(np.prod(instrument.shape)) * (0 if drawn else 22)
-        + (350 << 20),
+        + (550 << 20),
     )
 
 

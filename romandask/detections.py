@@ -57,7 +57,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         units,
         DetectTile(coadds, settings, region),
         schema("objects", bands),
-        bytes_per_unit=maker.pixels**2 * 4 * (3 * len(bands) + 8) + (200 << 20),
+        bytes_per_unit=maker.pixels**2 * 4 * (3 * len(bands) + 17) + (200 << 20),
     )
 
 

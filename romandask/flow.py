@@ -106,7 +106,7 @@ def stages(survey: Survey) -> list[Stage]:
     return found
 
 
-def plan(survey: Survey, memory_limit: float | None = None) -> list[Planned]:
+def plan(survey: Survey) -> list[Planned]:
     """Return units, bytes and peak memory of every stage, making nothing but the pointings.
 
     Raises
@@ -114,7 +114,7 @@ def plan(survey: Survey, memory_limit: float | None = None) -> list[Planned]:
     UserError
         Where a unit does not fit the memory of a worker, or an input is not what it should be.
     """
-    limit = survey.pipeline.run.memory_limit if memory_limit is None else memory_limit
+    limit = survey.pipeline.run.memory_limit
     rows = []
     for stage in stages(survey):
         product = stage.product(survey)

@@ -16,14 +16,14 @@ import xarray as xr
 from romandask.coadds import coadds
 from romandask.detections import detections, objects
 from romandask.exposures import exposures
-from romandask.instruments.exposure import Instrument, exposure_of
+from romandask.instruments.exposure import Instrument
 from romandask.matches import Matches, matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline, load_pipeline
-from romandask.pointings import corners_of, pointings
+from romandask.pointings import pointings
 from romandask.runtime.manifest import read_record
 from romandask.runtime.products import ImageProduct, TableProduct, Unit, conform, to_frame
 from romandask.runtime.schemas import schema
@@ -190,14 +190,6 @@ class Survey:
             self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths
         )
         return Statistics(self._stored(made.blends), self._stored(made.unrecognised))
-
-    def footprints(self, survey: str) -> np.ndarray:
-        """Return the corners (n, 4, 2), degrees, of the exposures of an instrument."""
-        return corners_of(self.pointings(survey))
-
-    def header(self, survey: str, row: int) -> dict:
-        """Return the FITS header of an exposure."""
-        return self._instrument(survey).header(exposure_of(self.pointings(survey).iloc[row]))
 
     def make_pointings(self, survey: str) -> pd.DataFrame:
         """Return the pointings made afresh, whatever the store has."""

@@ -5,7 +5,6 @@ The only module that knows distributed.
 
 from __future__ import annotations
 
-import os
 import queue
 import socket
 import time
@@ -196,8 +195,3 @@ def _free_port(wanted: int) -> int:
         except OSError:
             return 0
     return wanted
-
-
-def available_memory() -> int:
-    """Return the memory of this machine, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -7,6 +7,7 @@ from romandask.detections import detections, objects
 from romandask.exposures import exposures
 from romandask.matches import matches
 from romandask.model.errors import UserError
+from romandask.model.sky import Cone, Region
 from romandask.pipeline import Pipeline, load_pipeline
 from romandask.pointings import pointings
 from romandask.statistics import statistics
@@ -16,7 +17,9 @@ from romandask.truth import truth
 
 __version__ = _version("romandask")
 __all__ = [
+    "Cone",
     "Pipeline",
+    "Region",
     "Survey",
     "UserError",
     "coadds",

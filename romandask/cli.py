@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 # one thread a process: the workers are the parallelism
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -20,6 +20,8 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
+from romandask.export import export_obseq, export_truth  # noqa: E402
+from romandask.model.config import read_yaml  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline, pipeline_of  # noqa: E402
 from romandask.report import dag_svg, write_report  # noqa: E402
@@ -36,6 +38,8 @@ app = typer.Typer(
 )
 ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
 app.add_typer(ingest_app, name="ingest")
+export_app = typer.Typer(no_args_is_help=True, help="Write a survey's contents in other formats.")
+app.add_typer(export_app, name="export")
 
 Source = Annotated[
     str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
@@ -49,6 +53,10 @@ Scheduler = Annotated[
     str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
 ]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Folder of the store.")]
+Spectra = Annotated[
+    Path | None, typer.Option("--seds", help="Folder of the spectra that are named; default: seds beside SRC.")
+]
+Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
 
 
 @app.command()
@@ -60,15 +68,17 @@ def plan(
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
     rows = flow.plan(Survey(settings))
-    table = Table("stage", "units", "image bytes", "peak memory a worker")
+    table = Table("stage", "units", "image bytes", "core hours", "peak memory a worker")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
-        table.add_row(row.stage, str(row.units), size, f"{row.memory / 2**30:.2f} GiB")
+        hours = f"{row.hours:.2f}" if row.hours else "-"
+        table.add_row(row.stage, str(row.units), size, hours, f"{row.memory / 2**30:.2f} GiB")
     total = sum(row.units for row in rows)
     table.add_row(
         "total",
         str(total),
         f"{sum(row.bytes for row in rows) / 1e9:.2f} GB",
+        f"{sum(row.hours for row in rows):.2f}",
         f"limit {settings.run.memory_limit:.2f} GiB",
     )
     Console().print(table)
@@ -125,35 +135,97 @@ def report(store: StoreArgument) -> None:
 
 @ingest_app.command()
 def skycatalogs(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of skyCatalogs files.")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of skyCatalogs files, or its YAML file.")],
     store: Place,
-    seds: Annotated[
-        Path | None, typer.Option("--seds", help="Folder of the spectra that stars name; default: SRC/../seds.")
-    ] = None,
-    order: Annotated[int, typer.Option("--order", min=5, max=12, help="HEALPix order of the partitions.")] = 5,
+    seds: Spectra = None,
+    order: Order = 5,
     workers: Workers = 0,
 ) -> None:
     """Bring skyCatalogs in as HATS catalogs, with fluxes in all ten bands; bad rows go to quarantine."""
+    _ingest(source, {"source": "skycatalogs", "path": str(source.resolve())}, store, seds, order, workers)
+
+
+@ingest_app.command("instance-catalog")
+def instance_catalog(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="A phoSim instance catalog, text or .gz.")],
+    store: Place,
+    seds: Spectra = None,
+    order: Order = 5,
+    workers: Workers = 0,
+) -> None:
+    """Bring a DC2 instance catalog in: components of one galaxy become one row, shears are given the on-sky sign."""
+    _ingest(source, {"source": "instance_catalog", "path": str(source.resolve())}, store, seds, order, workers)
+
+
+@ingest_app.command()
+def table(
+    columns: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MAP", help="YAML with sections galaxies and stars, each with path and columns (ours: the file's)."
+        ),
+    ],
+    store: Place,
+    seds: Spectra = None,
+    order: Order = 5,
+    workers: Workers = 0,
+) -> None:
+    """Bring Parquet or FITS tables in, with a map of their columns."""
+    sections = read_yaml(columns)
+    unknown = sorted(set(sections) - {"galaxies", "stars"})
+    if unknown or not sections:
+        raise UserError(f"{columns}: holds {', '.join(unknown) or 'nothing'}; expected sections galaxies and stars")
+    content: dict[str, Any] = {"source": "table"}
+    for section, key in (("galaxies", "galaxy_table"), ("stars", "star_table")):
+        if isinstance(sections.get(section), dict) and "path" in sections[section]:
+            # as the map's author sees it
+            path = columns.resolve().parent / str(sections[section]["path"])
+            content[key] = sections[section] | {"path": str(path)}
+        elif section in sections:
+            raise UserError(f"{columns}: section {section} must hold path and columns")
+    _ingest(columns, content, store, seds, order, workers)
+
+
+def _ingest(
+    source: Path, truth: dict[str, Any], store: Path, seds: Path | None, order: int, workers: int | None
+) -> None:
     content = {
         "name": "ingest",
         "seed": 0,
         "region": {"ra": [0, 360], "dec": [-90, 90]},
-        "truth": {
-            "source": "skycatalogs", "path": str(source.resolve()), "order": order,
-            "seds": str((seds or source.parent / "seds").resolve()),
-        },
+        "truth": {**truth, "order": order, "seds": str((seds or source.resolve().parent / "seds").resolve())},
         "roman": {},
         "rubin": {},
-    }  # fmt: skip
+    }
     settings = pipeline_of(content, str(source))
     place = Store(store.resolve())
     survey = Survey(settings)
-    survey.truth_catalogs  # noqa: B018  opened, so that a wrong source is known before anything is written
+    survey.incoming_product  # noqa: B018  opened, so that a wrong source is known before anything is written
     place.prepare()
     reporter = Reporter(Console())
     with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
         counts = flow.ingest(settings, place, execution, reporter)
     reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")
+
+
+@export_app.command("truth")
+def export_truth_files(
+    store: StoreArgument, out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")]
+) -> None:
+    """Write the truth as galaxies.fits and stars.fits, and its spectra as seds.hdf5."""
+    for path in export_truth(open_survey(store), out):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@export_app.command("obseq")
+def export_visits(
+    pipeline: Source,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="FITS file.")],
+    overrides: Overrides = None,
+) -> None:
+    """Write all Roman visits of a pipeline as an observing sequence (FITS) that GalSim-based tools read."""
+    count = export_obseq(Survey(load_pipeline(pipeline, overrides)), out)
+    Console().print(f"wrote {count} visits to {out}", highlight=False, soft_wrap=True)
 
 
 @contextmanager

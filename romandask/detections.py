@@ -28,8 +28,9 @@ from romandask.model.sky import Region, cells_in_cone
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.model.tiles import Tile, TileGrid
 from romandask.runtime.hats import with_spatial_index
-from romandask.runtime.products import ImageProduct, TableProduct, Unit
+from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.units import Unit
 
 VISIT = 30.0
 """Seconds of a visit, where a coadd's weight is not its exposure time."""
@@ -58,6 +59,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         DetectTile(coadds, settings, region),
         schema("objects", bands),
         bytes_per_unit=maker.pixels**2 * 4 * (3 * len(bands) + 17) + (200 << 20),
+        seconds_per_unit=maker.pixels**2 * 1.2e-6,
     )
 
 
@@ -78,7 +80,7 @@ def objects(
         Unit(
             f"{settings.order}-{cell}",
             {"order": settings.order, "cell": cell},
-            tuple((detections.stage, detections.units[k].name) for k in members),
+            tuple((detections.stage, detections.names[k]) for k in members),
         )
         for cell, members in tiles_of.items()
     )

@@ -9,7 +9,7 @@ import pandas as pd
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from romandask.instruments.exposure import Instrument, exposure_of
+from romandask.instruments.exposure import Instrument, exposure_of, exposures_of
 from romandask.kernels.detector import DQ_FLAGS, observe
 from romandask.kernels.render import Scene, component_reach, draw, largest_stamp
 from romandask.kernels.scene import build_scene
@@ -17,8 +17,9 @@ from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
-from romandask.runtime.products import ImageProduct, Unit
+from romandask.runtime.products import Coordinates, ImageProduct
 from romandask.runtime.store import Variable
+from romandask.runtime.units import LazyUnits, Unit
 from romandask.truth import TruthCatalogs
 
 REACH = 30.0
@@ -64,23 +65,26 @@ def exposures(
         "n_waves": render.n_waves,
         "knot_smoothing": instrument.knot_smoothing,
     }
-    units = []
-    names = []
-    for row in range(len(table)):
-        exposure = exposure_of(table.iloc[row])
-        names.append(exposure.name)
-        ra, dec, radius = cone(corners_of(table.iloc[[row]])[0])
-        units.append(Unit(exposure.name, {**common, "row": row, **vars(exposure)}, truth.inputs(ra, dec, radius)))
+    every = exposures_of(table)
+    names = [exposure.name for exposure in every]
+    corners = corners_of(table)
+
+    def unit(row: int) -> Unit:
+        inputs = truth.inputs(*cone(corners[row]))
+        return Unit(names[row], {**common, "row": row, **vars(every[row])}, inputs)
+
     axes = ("exposure",)
-    columns = ("visit", "detector", "band", "mjd", "exptime", "ra", "dec", "pa")
-    coordinates = {name: (axes, table[name].to_numpy(), {}) for name in columns}
-    headers = [header_text(instrument.header(exposure_of(table.iloc[row]))) for row in range(len(table))]
-    coordinates["exposure"] = (axes, np.array(names, object), {})
-    coordinates["header"] = (
-        axes,
-        np.array(headers, object),
-        {"description": "FITS header of the WCS, 80-column cards"},
-    )
+
+    def coordinates() -> Coordinates:
+        columns = ("visit", "detector", "band", "mjd", "exptime", "ra", "dec", "pa")
+        headers = [header_text(instrument.header(exposure)) for exposure in every]
+        text = {"description": "FITS header of the WCS, 80-column cards"}
+        return {
+            **{name: (axes, table[name].to_numpy(), {}) for name in columns},
+            "exposure": (axes, np.array(names, object), {}),
+            "header": (axes, np.array(headers, object), text),
+        }
+
     flags = {"flag_masks": list(DQ_FLAGS.values()), "flag_meanings": " ".join(DQ_FLAGS)}
     planes = (
         Variable("image", "int32", (ny, nx), ("y", "x"), {"units": "electron", "long_name": "observed image"}),
@@ -95,7 +99,7 @@ def exposures(
     )
     return ImageProduct(
         f"exposures/{instrument.name}",
-        tuple(units),
+        LazyUnits(tuple(names), unit),
         RenderExposure(table, truth, instrument, render, seed),
         planes,
         axes,
@@ -104,6 +108,8 @@ def exposures(
         {"survey": instrument.name},
         # image, truth, dq, background and working copies; two PSF bases, the last and the new; the objects
         bytes_per_unit=ny * nx * 28 + 2 * render.n_waves * 36 * render.largest**2 + (150 << 20),
+        # sky, noise and storage; then objects
+        seconds_per_unit=ny * nx * 2.5e-7 + ny * nx * instrument.pixel_scale**2 / 3600 * 600 * 2.5e-4,
     )
 
 

@@ -9,15 +9,16 @@ from importlib.metadata import version
 
 import numpy as np
 
+from romandask.incoming import source_rows
 from romandask.model.errors import UserError
 from romandask.pipeline import Pipeline
 from romandask.runtime.cluster import Runner
-from romandask.runtime.hats import write_catalog_files
+from romandask.runtime.hats import margin, write_catalog_files
 from romandask.runtime.lock import locked
 from romandask.runtime.manifest import digest, read_record
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.progress import Reporter
-from romandask.runtime.store import Store, write_bytes, write_json
+from romandask.runtime.store import MARGIN, Store, write_bytes, write_json
 from romandask.runtime.work import Task
 from romandask.survey import Survey
 from romandask.truth import write_spectra
@@ -28,10 +29,13 @@ INTERPRETER = 420 << 20
 PACKAGES = (
     "romandask",
     "astropy",
+    "camb",
     "dask",
     "distributed",
     "drizzle",
     "galsim",
+    "glass",
+    "healpy",
     "numba",
     "numpy",
     "pyarrow",
@@ -62,6 +66,8 @@ class Planned:
     """Uncompressed size of the images; 0 where it depends on what is found."""
     memory: int
     """Peak of a worker, bytes."""
+    hours: float
+    """Of one core, as measured on a laptop."""
 
 
 @dataclass
@@ -74,36 +80,63 @@ class Summary:
     """stage/unit of units that were set aside, and of those that wait for them."""
 
 
+_SETTING = {
+    "coadds": "lower coadds.pixels",
+    "detections": "lower coadds.pixels",
+    "truth/structure": "lower truth.nside",
+    "truth": "raise truth.order",
+    "objects": "raise detections.order",
+    "matches": "raise matches.order",
+    "exposures": "lower render.largest",
+}
+"""What makes the units of a stage smaller."""
+
+
 def stages(survey: Survey) -> list[Stage]:
     """Return the stages of a survey in the order in which they run."""
     names = list(survey.instruments)
-    found = [
-        Stage("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec")),
-        Stage("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec")),
-        Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine),
-    ]
+    found = [_first(survey)]
+    found += _with_margin("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec"))
+    found += _with_margin("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec"))
+    found.append(Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine))
     found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
     found += [
         Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
         for name, instrument in survey.instruments.items()
         if instrument.coadd_from == "exposures"
     ]
-    for kind, position in (("coadd", None), ("detection", None), ("object", ("coord_ra", "coord_dec"))):
+    for kind in ("coadd", "detection"):
         found += [
-            Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name), position)
+            Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
             for name in names
         ]
+    for name in names:
+        found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
     if {"roman", "rubin"} <= set(names):
         found += [
             Stage(f"matches/{part}", lambda s, part=part: getattr(s.match_products, part))
             for part in ("local", "crossing", "merged")
         ]
-        found.append(Stage("matches/groups", lambda s: s.match_products.groups, ("coord_ra", "coord_dec")))
+        found += _with_margin("matches/groups", lambda s: s.match_products.groups, ("coord_ra", "coord_dec"))
         found += [
             Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
             for part in ("blends", "unrecognised")
         ]
     return found
+
+
+def _first(survey: Survey) -> Stage:
+    if survey.pipeline.truth.source == "generate":
+        return Stage("truth/structure", lambda s: s.truth_catalogs.structure)
+    return Stage("truth/incoming", lambda s: s.incoming_product)
+
+
+def _with_margin(name: str, product: Callable[[Survey], TableProduct], position: tuple[str, str]) -> list[Stage]:
+    """Return the stages of a HATS collection: the catalog, then its margin."""
+    return [
+        Stage(name, product, position),  # type: ignore[arg-type]
+        Stage(name + MARGIN, lambda s: margin(product(s)), position),
+    ]
 
 
 def plan(survey: Survey) -> list[Planned]:
@@ -120,16 +153,17 @@ def plan(survey: Survey) -> list[Planned]:
         product = stage.product(survey)
         memory = product.bytes_per_unit + INTERPRETER
         if memory > limit * 2**30 and product.units:
-            setting = "coadds.pixels" if stage.name.split("/")[0] in ("coadds", "detections") else "the truth's order"
+            setting = _SETTING.get(stage.name, _SETTING.get(stage.name.split("/")[0], "the size of the survey"))
             raise UserError(
-                f"{stage.name} {product.units[0].name} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
-                f"lower {setting} or raise run.memory_limit"
+                f"{stage.name} {product.names[0]} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
+                f"{setting}, or raise run.memory_limit"
             )
         size = 0
         if isinstance(product, ImageProduct):
             one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in product.variables)
             size = one * len(product.units)
-        rows.append(Planned(stage.name, len(product.units), size, memory))
+        hours = len(product.units) * product.seconds_per_unit / 3600
+        rows.append(Planned(stage.name, len(product.units), size, memory, hours))
     return rows
 
 
@@ -139,7 +173,7 @@ def run(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) ->
     with locked(store.root):
         survey = _begin(pipeline, store)
         for stage in stages(survey):
-            _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
+            _make_stage(stage, survey, store, runner, reporter, summary)
     return summary
 
 
@@ -156,22 +190,29 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
         survey = _begin(pipeline, store)
         for stage in stages(survey):
             if stage.name.startswith("truth/"):
-                _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
-    rows = {row["stage"]: row["rows"] for row in run_figures(store)}
-    out = rows.get("truth/galaxies", 0) + rows.get("truth/stars", 0)
-    counts = {"in": survey.truth_catalogs.source_rows, "out": out, "quarantined": rows.get("truth/quarantine", 0)}
+                _make_stage(stage, survey, store, runner, reporter, summary)
+    catalogs = survey.truth_catalogs
+    out = sum(int(product.column("n_rows").sum()) for product in (catalogs.galaxies, catalogs.stars))
+    aside = {row["stage"]: row["rows"] for row in run_figures(store)}.get("truth/quarantine", 0)
+    counts = {"in": source_rows(survey.incoming_product), "out": out, "quarantined": aside}
     if summary.failed or counts["in"] != counts["out"] + counts["quarantined"]:
         raise RuntimeError(f"rows are missing: {counts}; failed units: {summary.failed}")
     return counts
 
 
 def _begin(pipeline: Pipeline, store: Store) -> Survey:
-    """Store the resolved settings, the packages' versions and the library of spectra, and return the survey."""
+    """Store the resolved settings and the packages' versions, and return the survey."""
     write_bytes(store.pipeline, pipeline.to_yaml().encode())
     write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
-    survey = Survey(pipeline, store)
-    write_spectra(survey.truth_catalogs, store)
-    return survey
+    return Survey(pipeline, store)
+
+
+def _make_stage(
+    stage: Stage, survey: Survey, store: Store, runner: Runner, reporter: Reporter, summary: Summary
+) -> None:
+    _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
+    if stage.name == "truth/galaxies":
+        write_spectra(survey.truth_catalogs, store)
 
 
 def _run_stage(
@@ -191,7 +232,7 @@ def _run_stage(
                 if outcome.record is not None:
                     made += 1
                     continue
-                name = product.units[outcome.index].name
+                name = product.names[outcome.index]
                 summary.failed.append(f"{stage.name}/{name}")
                 write_bytes(_failure_path(store, product, name), str(outcome.failure).encode())
     summary.made[stage.name] = made
@@ -228,7 +269,7 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
 
 def _drop_strays(product: Product, store: Store) -> None:
     """Remove the records of units that the stage no longer has, and of failures that are tried again."""
-    names = {unit.name for unit in product.units}
+    names = set(product.names)
     for path in store.records(product.stage):
         if path.stem not in names:
             path.unlink()

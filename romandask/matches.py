@@ -16,9 +16,10 @@ from romandask.kernels.groups import label, links, merge, relabel
 from romandask.model.config import MatchSettings
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, cells_in_cone, unit_vectors
-from romandask.runtime.products import TableProduct, Unit
+from romandask.runtime.products import TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
+from romandask.runtime.units import Unit
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def matches(
         cells,
         settings.order,
         size,
-        store,
+        store=store,
     )
     return Matches(local, crossing, merged, groups)
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from romandask.formats import obseq, opsim
-from romandask.instruments.exposure import Exposure, Instrument, exposure_of
+from romandask.instruments.exposure import EXPOSURE_COLUMNS, Instrument
 from romandask.model.errors import UserError
-from romandask.model.sky import Region, chord, radec, touching_pairs, unit_vectors
+from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile
 
 READERS: dict[str, Callable[[Path], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
@@ -34,17 +33,19 @@ def pointings(
     UserError
         If the file cannot be read, or no exposure touches the region in one of the bands.
     """
-    if settings.source in READERS:
-        if not settings.path:
-            raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
-        visits = READERS[settings.source](data / settings.path)
-        origin = str(data / settings.path)
-    else:
-        visits = instrument.plan(region, seed)
-        origin = f"{instrument.name}.pointings ({settings.source})"
-    visits = visits[visits["band"].isin(instrument.bands)]
+    every = visits(instrument, settings, data, region, seed)
+    origin = f"{instrument.name}.pointings ({settings.source})" if settings.path is None else str(data / settings.path)
+    every = every[every["band"].isin(instrument.bands)]
     corners = np.stack([tile.corners(side) for tile in tiles])
-    rows = _exposures(instrument, visits[_near(visits, corners, instrument.field_radius)], corners)
+    near = every[_near(every, corners, instrument.field_radius)]
+    if (refused := instrument.refused(near)).any():
+        first = near[refused].iloc[0]
+        raise UserError(
+            f"{origin}: {int(refused.sum())} visits of {instrument.name} cannot be pointed, the first is visit "
+            f"{first['visit']} (MJD {first['mjd']:.2f}, ra {first['ra']:.3f}, dec {first['dec']:.3f}): the Sun is too "
+            f"near or too far there: correct the pointings"
+        )
+    rows = _exposures(instrument, near, corners)
     missing = [band for band in instrument.bands if band not in set(rows["band"])]
     if missing:
         ra, dec = region.centre
@@ -53,6 +54,15 @@ def pointings(
             f"ra {ra:.3f}, dec {dec:.3f}: change region, the pointings or {instrument.name}.bands"
         )
     return rows
+
+
+def visits(instrument: Instrument, settings, data: Path, region: Region, seed: int) -> pd.DataFrame:
+    """Return all visits of the observing sequence, whether or not they touch the region."""
+    if settings.source not in READERS:
+        return instrument.plan(region, seed)
+    if not settings.path:
+        raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
+    return READERS[settings.source](data / settings.path)
 
 
 def corners_of(table: pd.DataFrame) -> np.ndarray:
@@ -69,33 +79,12 @@ def _near(visits: pd.DataFrame, corners: np.ndarray, radius: float) -> np.ndarra
     return np.linalg.norm(vectors - centre, axis=1) < spread + chord(radius * 3600)
 
 
-def _exposures(instrument: Instrument, visits: pd.DataFrame, corners: np.ndarray) -> pd.DataFrame:
-    vectors = unit_vectors(corners[..., 0], corners[..., 1]).reshape(-1, 3)
-    middle = vectors.mean(axis=0) / np.linalg.norm(vectors.mean(axis=0))
-    ra, dec = (float(value) for value in radec(middle))
-    radius = np.degrees(2 * np.arcsin(np.linalg.norm(vectors - middle, axis=1).max() / 2))
-    rows: list[dict] = []
-    for _, visit in visits.assign(detector=0).iterrows():
-        first = exposure_of(visit)
-        try:
-            footprints = instrument.footprints(first, ra, dec, radius)
-        except (ValueError, RuntimeError) as error:
-            raise UserError(
-                f"{instrument.name} visit {first.visit} (MJD {first.mjd:.2f}, ra {first.ra:.3f}, dec {first.dec:.3f}): "
-                f"cannot be pointed: {error}"
-            ) from None
-        if not footprints:
-            continue
-        detectors = list(footprints)
-        touching, _ = touching_pairs(np.stack(list(footprints.values())), corners)
-        for k in np.unique(touching):
-            rows.append(_row(replace(first, detector=detectors[k]), footprints[detectors[k]]))
-    columns = [*_row(_BLANK, np.zeros((4, 2)))]
-    return pd.DataFrame(rows, columns=columns).sort_values(["visit", "detector"], ignore_index=True)
-
-
-_BLANK = Exposure(0, 0, "", 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def _row(exposure: Exposure, corners: np.ndarray) -> dict:
-    return vars(exposure) | dict(zip(CORNERS, corners.ravel().tolist(), strict=True))
+def _exposures(instrument: Instrument, visits: pd.DataFrame, tiles: np.ndarray) -> pd.DataFrame:
+    """Return a row for each detector of the visits that touches a tile (tiles, 4, 2), by visit and detector."""
+    footprints = instrument.footprints(visits).reshape(-1, 4, 2)
+    touching = np.unique(touching_pairs(footprints, tiles)[0])
+    visit, detector = np.divmod(touching, len(instrument.detectors))
+    rows = visits.iloc[visit].assign(detector=np.array(instrument.detectors, int)[detector])
+    rows = rows[list(EXPOSURE_COLUMNS)].reset_index(drop=True)
+    outline = pd.DataFrame(footprints[touching].reshape(-1, 8), columns=list(CORNERS))
+    return pd.concat([rows, outline], axis=1).sort_values(["visit", "detector"], ignore_index=True)

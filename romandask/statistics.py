@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from romandask.matches import length_name
-from romandask.runtime.products import TableProduct, Unit
+from romandask.runtime.products import TableProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.units import Unit
 
 MAG_EDGES = np.arange(18.0, 28.01, 0.5)
 """Bins of i magnitude."""

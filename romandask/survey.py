@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,20 @@ import xarray as xr
 from romandask.coadds import coadds
 from romandask.detections import detections, objects
 from romandask.exposures import exposures
+from romandask.incoming import incoming, open_sources
 from romandask.instruments.exposure import Instrument
 from romandask.matches import Matches, matches
 from romandask.model.errors import UserError
-from romandask.model.sky import Region
+from romandask.model.sky import Cone, Region
 from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline, load_pipeline
-from romandask.pointings import pointings
+from romandask.pointings import pointings, visits
 from romandask.runtime.manifest import read_record
-from romandask.runtime.products import ImageProduct, TableProduct, Unit, conform, to_frame
+from romandask.runtime.products import ImageProduct, TableProduct, conform, to_frame
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store, read_parquet
+from romandask.runtime.units import Unit
 from romandask.statistics import Statistics, matrix, statistics
 from romandask.truth import TruthCatalogs, truth
 
@@ -48,13 +49,24 @@ class Survey:
 
     # ---- what users ask for
 
-    def truth(self, kind: str) -> dd.DataFrame:
-        """Return the lazy truth catalog `galaxies` or `stars` (schema: catalogs/<kind>.yaml)."""
-        return self._one(vars(self.truth_catalogs), kind, ("galaxies", "stars", "quarantine")).frame
+    def truth(self, kind: str, region: Region | Cone | None = None) -> dd.DataFrame:
+        """Return the lazy truth catalog `galaxies` or `stars` (schema: catalogs/<kind>.yaml).
+
+        With a region only the partitions that it touches are read, and only its rows are returned.
+        """
+        kinds = ("galaxies", "stars", "quarantine") if region is None else ("galaxies", "stars")
+        product = self._one(vars(self.truth_catalogs), kind, kinds)
+        return product.frame if region is None else product.within(region)
 
     def pointings(self, survey: str) -> pd.DataFrame:
         """Return the exposures of an instrument, one row a visit and detector."""
         return self._once("pointings", survey, lambda: self._read_pointings(survey))
+
+    def visits(self, survey: str) -> pd.DataFrame:
+        """Return all visits of an instrument's observing sequence, whether or not they touch the region."""
+        settings = self.pipeline
+        instrument = self._instrument(survey)
+        return visits(instrument, getattr(settings, survey).pointings, self.data, self.region, settings.seed)
 
     def exposures(self, survey: str) -> xr.Dataset:
         """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ..."""
@@ -119,14 +131,16 @@ class Survey:
         return Path(self.pipeline.data)
 
     @cached_property
+    def incoming_product(self) -> TableProduct:
+        """The rows of the source catalogs, where truth is not generated."""
+        return self._stored(incoming(open_sources(self.pipeline.truth, self.data)))
+
+    @cached_property
     def truth_catalogs(self) -> TruthCatalogs:
         """The truth catalogs."""
         settings = self.pipeline
-        made = truth(settings.truth, self.data, self.region, self.bandpasses, settings.seed)
-        if self.store is None:
-            return made
-        tables = {name: getattr(made, name).stored(self.store) for name in ("galaxies", "stars", "quarantine")}
-        return replace(made, **tables)
+        rows = None if settings.truth.source == "generate" else self.incoming_product
+        return truth(settings.truth, self.data, self.region, self.bandpasses, settings.seed, self.store, rows)
 
     def pointing_product(self, survey: str) -> TableProduct:
         """The pointings as a product of one unit."""

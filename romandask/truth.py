@@ -1,4 +1,4 @@
-"""The true universe: galaxies and stars as HATS catalogs, from the generator or from skyCatalogs files."""
+"""The true universe: galaxies and stars as HATS catalogs, generated or from source catalogs."""
 
 from __future__ import annotations
 
@@ -11,23 +11,27 @@ import numpy as np
 import pandas as pd
 import zarr
 
-from romandask.formats import skycatalogs
 from romandask.formats import spectra as spectra_files
-from romandask.kernels import universe
-from romandask.kernels.bandpasses import rubin_bandpass
-from romandask.kernels.photometry import Spectra, njy
-from romandask.kernels.scene import COMPONENTS, Truth, galaxy_photons, star_photons
+from romandask.generated import GenerateGalaxies, GenerateStars, NothingSetAside, matter, templates
+from romandask.incoming import Assemble, Quarantine, contents, edges_of, incoming, open_sources
+from romandask.kernels.scene import Truth, bind
 from romandask.model.config import TruthSettings
 from romandask.model.sky import Region, cell_area, cells_in_cone
-from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra
-from romandask.runtime.hats import with_spatial_index
-from romandask.runtime.products import TableProduct, Unit
+from romandask.model.spectra import Bandpass, SpectrumLibrary
+from romandask.runtime.manifest import digest
+from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store, write_coordinate
+from romandask.runtime.units import Unit
 
 WIDE = 1e7
 """Square arcminutes above which the cells of a region are not listed one by one."""
-_NO_BINS = np.zeros(0, np.float32)
+NEAR_ORDER = 11
+"""HEALPix order of the cells, 1.7 arcmin wide, that decide which rows are near."""
+BYTES_A_ROW = 2200
+"""Peak memory of a galaxy while a partition is made: its row, its random numbers and its photons."""
+SOURCE_DENSITY = 600.0
+"""Galaxies a square arcminute that partitions of source catalogs are sized for."""
 
 
 @dataclass(frozen=True)
@@ -37,38 +41,54 @@ class TruthCatalogs:
     galaxies: TableProduct
     stars: TableProduct
     quarantine: TableProduct
+    structure: ImageProduct | None
+    """Matter of a generated universe."""
+    incoming: TableProduct | None
+    """Rows of source catalogs."""
     library: SpectrumLibrary
     edges: tuple[float, ...]
     """Edges of top-hat bins, nm; empty where no galaxy has a top-hat spectrum."""
     internal_frame: str
-    source_rows: int = 0
-    """Rows of the source files that the region touches."""
+    """"rest" or "observed": where the galaxies' own dust acts."""
 
     def near(self, ra: float, dec: float, radius: float) -> Truth:
-        """Return the rows of the partitions that touch a cone (degrees), with their spectra."""
-        pixels = set(map(int, cells_in_cone(ra, dec, radius, self.galaxies.order or 0)))
-        tables = []
-        for product in (self.galaxies, self.stars):
-            chosen = [index for index, pixel in enumerate(product.pixels or ()) if pixel in pixels]
-            parts = [product.load(index) for index in chosen]
-            empty = product.schema.empty_table().to_pandas()
-            filled = [part for part in parts if len(part)]
-            tables.append(pd.concat(filled, ignore_index=True) if filled else empty)
-        return bind(tables[0], tables[1], self.library, self.edges, self.internal_frame)
+        """Return the rows around a cone (degrees), with their spectra: no more of a partition than the cone needs."""
+        galaxies, stars = (_rows_near(product, ra, dec, radius) for product in (self.galaxies, self.stars))
+        return bind(galaxies, stars, self.library, self.edges, self.internal_frame)
 
     def inputs(self, ra: float, dec: float, radius: float) -> tuple[tuple[str, str], ...]:
         """Return the units that `near` reads."""
-        pixels = set(map(int, cells_in_cone(ra, dec, radius, self.galaxies.order or 0)))
         return tuple(
-            (product.stage, unit.name)
+            (product.stage, product.names[index])
             for product in (self.galaxies, self.stars)
-            for unit, pixel in zip(product.units, product.pixels or (), strict=True)
-            if pixel in pixels
+            for index in product.touching(cells_in_cone(ra, dec, radius, product.order or 0))
         )
 
 
+def _rows_near(product: TableProduct, ra: float, dec: float, radius: float) -> pd.DataFrame:
+    """Return the rows of the cells that touch a cone, sorted by their place, without the columns of fluxes."""
+    order = max(product.order or 0, NEAR_ORDER)
+    cells = cells_in_cone(ra, dec, radius, order)
+    home = cells >> (2 * (order - (product.order or 0)))
+    shift = 2 * (29 - order)
+    columns = [name for name in product.schema.names if not name.startswith(("flux_", "dust_", "lsst_flux_"))]
+    parts = []
+    for index in product.touching(np.unique(home)):
+        own = cells[home == (product.pixels or ())[index]]
+        near = product.select(index, columns, (int(own[0]) << shift, (int(own[-1]) + 1) << shift))
+        parts.append(near[np.isin(near["_healpix_29"].to_numpy() >> shift, own)])
+    filled = [part for part in parts if len(part)]
+    return pd.concat(filled, ignore_index=True) if filled else product.empty()[columns]
+
+
 def truth(
-    settings: TruthSettings, data: Path, region: Region, bandpasses: dict[str, Bandpass], seed: int
+    settings: TruthSettings,
+    data: Path,
+    region: Region,
+    bandpasses: dict[str, Bandpass],
+    seed: int,
+    store: Store | None = None,
+    rows: TableProduct | None = None,
 ) -> TruthCatalogs:
     """Return the lazy truth catalogs over a region.
 
@@ -76,69 +96,120 @@ def truth(
     ----------
     data : folder that the settings' paths are below
     bandpasses : by band; the catalogs hold the flux of every object in each
+    store : where units that are there are read from
+    rows : the source catalogs' rows (incoming.incoming); opened here where they are not given
 
     Raises
     ------
     UserError
         If a source file is missing or not what it should be.
     """
-    frame = "rest" if settings.dust == "physical" else "observed"
     if settings.source == "generate":
-        library = spectra_files.templates(universe.GALAXY_TEMPLATES, universe.STAR_TEMPERATURES)
-        cells = region.cells(settings.order, settings.margin)
-        common = (settings, region, bandpasses, seed, library, cells)
-        makers: dict[str, Callable[[int], pd.DataFrame]] = {
-            "galaxies": _GenerateGalaxies(*common), "stars": _GenerateStars(*common), "quarantine": _Nothing()
-        }  # fmt: skip
-        source_state: Any = "generate"
-        edges: tuple[float, ...] = ()
-        files: list[str] = []
-        rows = 0
-    else:
-        source = skycatalogs.open_source(data / str(settings.path))
-        near = skycatalogs.around(region.cells(skycatalogs.ORDER, settings.margin).tolist())
-        parents = [cell for cell in near if cell in source.galaxies or cell in source.stars]
-        names = skycatalogs.sed_names(source, parents)
-        library, unusable = spectra_files.read_folder(data / (settings.seds or "seds"), names)
-        depth = 2 * (settings.order - skycatalogs.ORDER)
-        children = [np.arange(cell << depth, (cell + 1) << depth) for cell in skycatalogs.around(parents)]
-        cells = np.concatenate(children) if children else np.empty(0, np.int64)
-        if region.area < WIDE:
-            cells = np.intersect1d(cells, region.cells(settings.order, settings.margin))
-        options = (settings, region, bandpasses, source, library, unusable, cells)
-        makers = {
-            "galaxies": _ReadGalaxies(*options), "stars": _ReadStars(*options),
-            "quarantine": _ReadBad(source, unusable, tuple(parents)),
-        }  # fmt: skip
-        source_state = {"files": source.files(), "seds": list(library.names)}
-        edges = source.edges
-        rows = skycatalogs.count_rows(source, parents)
-        files = [
-            f"{kind}_{cell}" for cell in parents for kind in ("galaxy", "pointsource") if cell in _kind(source, kind)
-        ]
-    bands = tuple(bandpasses)
+        return _generated(settings, data, region, bandpasses, seed, store)
+    if rows is None:
+        rows = _kept(incoming(open_sources(settings, data)), store)
+    return _from_sources(settings, data, region, bandpasses, store, rows)
+
+
+def _generated(
+    settings: TruthSettings,
+    data: Path,
+    region: Region,
+    bandpasses: dict[str, Bandpass],
+    seed: int,
+    store: Store | None,
+) -> TruthCatalogs:
+    spectra = templates(data / settings.star_seds if settings.star_seds else None)
+    cells = region.cells(settings.order, settings.margin)
+    field = _kept(matter(settings, region, seed), store)
+    common = (settings, region, bandpasses, seed, spectra, cells)
+    shared = {
+        "seed": seed,
+        "bands": tuple(bandpasses),
+        "region": vars(region),
+        "spectra": digest(spectra.library.photons),
+    }
+    table = _tables(settings, cells, tuple(bandpasses), settings.galaxies)
+    apart = ("stars", "star_seds", "order"), ("galaxies", "nside", "shear", "dust", "order", "star_seds")
+    state = [shared | {"settings": settings.model_dump(exclude=set(names))} for names in apart]
+    return TruthCatalogs(
+        _kept(table("galaxies", GenerateGalaxies(*common, field), state[0], ((field.stage, "all"),)), store),
+        _kept(table("stars", GenerateStars(*common), state[1], ()), store),
+        _kept(TableProduct("truth/quarantine", (), NothingSetAside(), schema("quarantine")), store),
+        field,
+        None,
+        spectra.library,
+        (),
+        _frame(settings),
+    )
+
+
+def _from_sources(
+    settings: TruthSettings,
+    data: Path,
+    region: Region,
+    bandpasses: dict[str, Bandpass],
+    store: Store | None,
+    rows: TableProduct,
+) -> TruthCatalogs:
+    found = contents(rows, settings.order)
+    folder = data / (settings.seds or "seds")
+    library, unusable = spectra_files.read_folder(folder, list(found.spectra))
+    edges = edges_of(rows)
+    # components of a galaxy that lie apart across an edge are each looked at where they are
+    cells = found.cells
+    if region.area < WIDE:
+        cells = np.intersect1d(cells, region.cells(settings.order, settings.margin))
+    makers = {
+        kind: Assemble(settings, region, bandpasses, rows, edges, library, unusable, cells, kind)
+        for kind in ("galaxy", "star")
+    }
     state = {
         "settings": settings.model_dump(),
-        "seed": seed,
-        "source": source_state,
-        "bands": bands,
+        "bands": tuple(bandpasses),
         "region": vars(region),
+        "spectra": digest(library.photons),
+        "unusable": unusable,
     }
-    units = tuple(Unit(f"{settings.order}-{cell}", {**state, "cell": int(cell)}) for cell in cells)
-    per_cell = int(cell_area(settings.order) * settings.galaxies * 1500) + (200 << 20)
-
-    def table(kind: str) -> TableProduct:
-        return TableProduct(
-            f"truth/{kind}", units, makers[kind], schema(kind, bands), tuple(map(int, cells)), settings.order, per_cell
-        )
-
+    inputs = tuple((rows.stage, unit.name) for unit in rows.units)
+    table = _tables(settings, cells, tuple(bandpasses), SOURCE_DENSITY)
+    galaxies = _kept(table("galaxies", makers["galaxy"], state, inputs), store)
+    per_batch = [Unit(unit.name, state, ((rows.stage, unit.name),)) for unit in rows.units]
+    per_cell = [Unit(f"cell-{unit.name}", state, inputs) for unit in galaxies.units]
     quarantine = TableProduct(
         "truth/quarantine",
-        tuple(Unit(name, state) for name in files),
-        makers["quarantine"],
+        (*per_batch, *per_cell),
+        Quarantine(makers["galaxy"]),
         schema("quarantine"),
+        bytes_per_unit=max(rows.bytes_per_unit, galaxies.bytes_per_unit),
     )
-    return TruthCatalogs(table("galaxies"), table("stars"), quarantine, library, edges, frame, rows)
+    stars = _kept(table("stars", makers["star"], state, inputs), store)
+    return TruthCatalogs(galaxies, stars, _kept(quarantine, store), None, rows, library, edges, _frame(settings))
+
+
+def _frame(settings: TruthSettings) -> str:
+    return "rest" if settings.dust == "physical" else "observed"
+
+
+def _kept(product: Any, store: Store | None) -> Any:
+    return product if store is None else product.stored(store)
+
+
+def _tables(
+    settings: TruthSettings, cells: np.ndarray, bands: tuple[str, ...], density: float
+) -> Callable[..., TableProduct]:
+    """Return a function that makes the product of one kind of object over the cells."""
+    per_cell = int(cell_area(settings.order) * density * BYTES_A_ROW) + (150 << 20)
+
+    def table(kind: str, make: Callable[[int], pd.DataFrame], state: Any, inputs: tuple) -> TableProduct:
+        units = tuple(Unit(f"{settings.order}-{cell}", {**state, "cell": int(cell)}, inputs) for cell in cells)
+        pixels = tuple(map(int, cells))
+        seconds = cell_area(settings.order) * density * 2e-5
+        return TableProduct(
+            f"truth/{kind}", units, make, schema(kind, bands), pixels, settings.order, per_cell, seconds
+        )
+
+    return table
 
 
 def write_spectra(catalogs: TruthCatalogs, store: Store) -> None:
@@ -153,166 +224,3 @@ def write_spectra(catalogs: TruthCatalogs, store: Store) -> None:
     if catalogs.edges:
         text = {"units": "nm", "long_name": "rest-frame edges of the bins of sed_val_*"}
         write_coordinate(group, "tophat_edges", np.array(catalogs.edges), ("edge",), text)
-
-
-def bind(
-    galaxies: pd.DataFrame, stars: pd.DataFrame, library: SpectrumLibrary, edges: tuple[float, ...], frame: str
-) -> Truth:
-    """Return rows together with the spectra they refer to."""
-    return Truth(
-        galaxies,
-        stars,
-        {component: _spectra(galaxies, component, library, edges) for component in COMPONENTS},
-        LibrarySpectra(library, stars["sed"].to_numpy(int)),
-        frame,
-    )
-
-
-def _spectra(galaxies: pd.DataFrame, component: str, library: SpectrumLibrary, edges: tuple[float, ...]) -> Spectra:
-    index = galaxies[f"{component}_sed"].to_numpy(int)
-    if len(index) and (index < 0).all():
-        return TophatSpectra(np.stack(galaxies[f"sed_val_{component}"].to_numpy()).astype(float), np.array(edges))
-    return LibrarySpectra(library, index)
-
-
-def _with_fluxes(truth: Truth, kind: str, bandpasses: dict[str, Bandpass]) -> pd.DataFrame:
-    if kind == "stars":
-        fluxes = {band: star_photons(truth, bandpass) for band, bandpass in bandpasses.items()}
-        frame = truth.stars
-    else:
-        fluxes = {
-            band: np.sum([galaxy_photons(truth, bandpass, component) for component in COMPONENTS], axis=0)
-            for band, bandpass in bandpasses.items()
-        }
-        frame = truth.galaxies
-    columns = {f"flux_{band}": njy(value.sum(axis=1), bandpasses[band]) for band, value in fluxes.items()}
-    return with_spatial_index(frame.assign(**columns))
-
-
-@dataclass(frozen=True)
-class _Nothing:
-    def __call__(self, index: int) -> pd.DataFrame:
-        raise IndexError("the generator sets no rows aside")
-
-
-@dataclass(frozen=True)
-class _Generate:
-    settings: TruthSettings
-    region: Region
-    bandpasses: dict[str, Bandpass]
-    seed: int
-    library: SpectrumLibrary
-    cells: np.ndarray
-
-    def _rows(self, index: int, make: Callable[..., pd.DataFrame], density: float) -> pd.DataFrame:
-        depth = 2 * (universe.CELL_ORDER - self.settings.order)
-        first = int(self.cells[index]) << depth
-        wanted = self.region.cells(universe.CELL_ORDER, self.settings.margin)
-        wanted = wanted[(wanted >= first) & (wanted < first + (1 << depth))]
-        r_band = rubin_bandpass("r", 2, 1.0)
-        parts = [make(int(cell), self.seed, density, self.library, r_band) for cell in wanted]
-        parts = [part for part in parts if len(part)] or [make(first, self.seed, 0.0, self.library, r_band)]
-        frame = pd.concat(parts, ignore_index=True)
-        return frame[self.region.contains(frame["ra"], frame["dec"], self.settings.margin)].reset_index(drop=True)
-
-
-class _GenerateGalaxies(_Generate):
-    def __call__(self, index: int) -> pd.DataFrame:
-        frame = self._rows(index, universe.galaxies, self.settings.galaxies)
-        frame = frame.assign(**{f"sed_val_{component}": [_NO_BINS] * len(frame) for component in COMPONENTS})
-        frame_of_dust = "rest" if self.settings.dust == "physical" else "observed"
-        none = pd.DataFrame({"sed": np.empty(0, int)})
-        return _with_fluxes(bind(frame, none, self.library, (), frame_of_dust), "galaxies", self.bandpasses)
-
-
-class _GenerateStars(_Generate):
-    def __call__(self, index: int) -> pd.DataFrame:
-        frame = self._rows(index, universe.stars, self.settings.stars)
-        none = pd.DataFrame({f"{component}_sed": np.empty(0, int) for component in COMPONENTS})
-        return _with_fluxes(bind(none, frame, self.library, (), "rest"), "stars", self.bandpasses)
-
-
-@dataclass(frozen=True)
-class _Read:
-    settings: TruthSettings
-    region: Region
-    bandpasses: dict[str, Bandpass]
-    source: skycatalogs.Source
-    library: SpectrumLibrary
-    unusable: dict[str, str]
-    cells: np.ndarray
-
-    def _inside(self, frame: pd.DataFrame, index: int) -> pd.DataFrame:
-        """Good rows of the partition and of the region."""
-        good = frame[frame["reason"] == ""]
-        good = good[self.region.contains(good["ra"], good["dec"], self.settings.margin)]
-        located = with_spatial_index(good)
-        depth = 2 * (29 - self.settings.order)
-        mine = (located["_healpix_29"].to_numpy() >> depth) == int(self.cells[index])
-        return located[mine].reset_index(drop=True)
-
-    def _files(self, index: int, files: dict[int, Path]) -> list[int]:
-        """The files that may hold rows of the partition: its own and those around."""
-        own = int(self.cells[index]) >> (2 * (self.settings.order - skycatalogs.ORDER))
-        return [cell for cell in skycatalogs.around([own]) if cell in files]
-
-
-class _ReadGalaxies(_Read):
-    def __call__(self, index: int) -> pd.DataFrame:
-        files = self._files(index, self.source.galaxies)
-        parts = [self._inside(skycatalogs.read_galaxies(self.source, cell), index) for cell in files]
-        parts = [part for part in parts if len(part)]
-        if not parts:
-            return schema("galaxies", tuple(self.bandpasses)).empty_table().to_pandas()
-        frame = pd.concat(parts, ignore_index=True)
-        frame["n_knots"] = frame["n_knots"].fillna(0)
-        # NaN means, as inf does, that the component has no light
-        for component in COMPONENTS:
-            frame[f"{component}_magnorm"] = frame[f"{component}_magnorm"].fillna(np.inf)
-            frame[f"{component}_sed"] = -1
-        # cosmoDC2's spectra hold the galaxies' own dust
-        frame = frame.assign(bulge_av=0.0, bulge_rv=3.1, disk_av=0.0, disk_rv=3.1)
-        none = pd.DataFrame({"sed": np.empty(0, int)})
-        return _with_fluxes(bind(frame, none, self.library, self.source.edges, "rest"), "galaxies", self.bandpasses)
-
-
-class _ReadStars(_Read):
-    def __call__(self, index: int) -> pd.DataFrame:
-        files = self._files(index, self.source.stars)
-        parts = [self._inside(skycatalogs.read_stars(self.source, cell, self.unusable), index) for cell in files]
-        parts = [part for part in parts if len(part)]
-        if not parts:
-            return schema("stars", tuple(self.bandpasses)).empty_table().to_pandas()
-        frame = pd.concat(parts, ignore_index=True)
-        place = {name: row for row, name in enumerate(self.library.names)}
-        frame["sed"] = frame["sed_filepath"].map(place).astype(int)
-        none = pd.DataFrame({f"{component}_sed": np.empty(0, int) for component in COMPONENTS})
-        return _with_fluxes(bind(none, frame, self.library, (), "rest"), "stars", self.bandpasses)
-
-
-@dataclass(frozen=True)
-class _ReadBad:
-    source: skycatalogs.Source
-    unusable: dict[str, str]
-    parents: tuple[int, ...]
-
-    def __call__(self, index: int) -> pd.DataFrame:
-        pairs = [
-            (cell, kind)
-            for cell in self.parents
-            for kind in ("galaxy", "pointsource")
-            if cell in _kind(self.source, kind)
-        ]
-        cell, kind = pairs[index]
-        if kind == "galaxy":
-            frame, name = skycatalogs.read_galaxies(self.source, cell), "galaxy_id"
-        else:
-            frame, name = skycatalogs.read_stars(self.source, cell, self.unusable), "id"
-        bad = frame[frame["reason"] != ""]
-        return pd.DataFrame(
-            {"source": _kind(self.source, kind)[cell].name, "row": bad.index, "id": bad[name], "reason": bad["reason"]}
-        )
-
-
-def _kind(source: skycatalogs.Source, kind: str) -> dict[int, Path]:
-    return source.galaxies if kind == "galaxy" else source.stars

@@ -77,7 +77,7 @@ class SmallSurvey:
         self.region = Region(ra.min(), ra.max(), dec.min(), dec.max())
         rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
         bandpasses = {"H158": self.roman.bandpass("H158"), "i": rubin.bandpass("i")}
-        self.truth = truth(TruthSettings(order=11, margin=5.0), Path("."), self.region, bandpasses, 5)
+        self.truth = truth(TruthSettings(order=11, margin=5.0, nside=64), Path("."), self.region, bandpasses, 5)
         self.product = exposures(self.table, self.truth, self.roman, RenderSettings(n_waves=3), 5)
         self.settings = CoaddSettings(pixels=260, overlap=30)
         self.tiles = self.settings.grid().covering(self.region)

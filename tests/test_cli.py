@@ -64,12 +64,12 @@ def test_a_region_without_pointings_and_a_catalog_without_a_column(shared, tmp_p
     folder = tmp_path / "catalog"
     folder.mkdir()
     (folder / "skyCatalog.yaml").write_bytes((shared / "skycatalogs_sample" / "skyCatalog.yaml").read_bytes())
-    table = pq.read_table(shared / "skycatalogs_sample" / "galaxy_9683.parquet").drop_columns(["redshift"])
+    table = pq.read_table(shared / "skycatalogs_sample" / "galaxy_9683.parquet").drop_columns(["convergence"])
     pq.write_table(table, folder / "galaxy_9683.parquet")
     done = command("ingest", "skycatalogs", "catalog", "--store", "s", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
-    assert "galaxy_9683.parquet: column 'redshift' is missing" in done.stderr
+    assert "galaxy_9683.parquet: column 'convergence' is missing" in done.stderr
     assert not (tmp_path / "s").exists()
 
 
@@ -86,4 +86,4 @@ def test_ingest_accounts_for_every_row(shared, tmp_path):
     done = command("ingest", "skycatalogs", str(shared / "skycatalogs_sample"), "--store", "s", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "rows in 4987 = rows out" in done.stdout
-    assert (tmp_path / "s" / "truth" / "galaxies" / "hats.properties").is_file()
+    assert (tmp_path / "s" / "truth" / "galaxies" / "collection.properties").is_file()

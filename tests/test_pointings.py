@@ -10,7 +10,8 @@ from astropy.io import fits
 
 from romandask.formats import obseq, opsim
 from romandask.instruments.exposure import exposure_of, footprint
-from romandask.instruments.roman import Roman, RomanPointings, RomanSettings, best_roll
+from romandask.instruments.roman import Roman, RomanPointings, RomanSettings
+from romandask.instruments.roman_sun import best_roll
 from romandask.instruments.rubin import Rubin, RubinPointings, RubinSettings, detector_centres
 from romandask.model.config import CoaddSettings
 from romandask.model.errors import UserError
@@ -126,34 +127,15 @@ def test_a_footprint_of_the_table_is_that_of_the_header():
         np.testing.assert_allclose(corners_of(table)[row], expected, atol=1e-9)
 
 
-def test_the_quick_look_at_scas_loses_none():
-    roman = Roman(RomanSettings(bands=("H158",)))
-    visit = exposure_of(roman.plan(REGION, 0).assign(detector=0).iloc[5])
-    every = roman.footprints(visit, visit.ra, visit.dec, 5.0)
-    assert len(every) == 18
-    tiles = np.stack([tile.corners(GRID.side) for tile in TILES])
-    touching = {sca for sca, corners in every.items() if len(touching_pairs(corners[None], tiles)[0])}
-    assert touching <= set(roman.footprints(visit, *REGION.centre, 0.02))
-
-
 def test_the_cadence_visits_a_point_as_often_as_asked():
     rubin = Rubin(RubinSettings())
     table = pointings(rubin, RubinPointings(), Path("."), REGION, TILES, GRID.side, 3)
     point = np.array([[[53.03, -40.005], [53.03001, -40.005], [53.03, -40.00499]]])
     for band, expected in RubinPointings().visits.items():
         count = len(touching_pairs(point, corners_of(table[table["band"] == band]))[0])
-        assert count == pytest.approx(expected * 0.9, abs=5 * np.sqrt(expected))
+        assert count == pytest.approx(expected, abs=5 * np.sqrt(expected))
     assert 0.5 < table["seeing"].median() < 0.75
     assert len(detector_centres()) == 189
-
-
-def test_rubin_footprints_are_those_of_the_headers():
-    rubin = Rubin(RubinSettings())
-    visit = exposure_of(rubin.plan(REGION, 1).assign(detector=0).iloc[3])
-    every = rubin.footprints(visit, 0, 0, 1)
-    for detector in (0, 94, 188):
-        header = rubin.header(type(visit)(**(vars(visit) | {"detector": detector})))
-        np.testing.assert_allclose(every[detector], footprint(header, rubin.shape), atol=1e-8)
 
 
 def test_a_region_without_pointings_is_refused(shared):

@@ -13,7 +13,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "romandask"
 LAYERS = [
     {"cli"},
-    {"report"},
+    {"report", "export"},
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
@@ -21,6 +21,7 @@ LAYERS = [
     {"coadds"},
     {"exposures"},
     {"pointings", "truth"},
+    {"generated", "incoming"},
     {"instruments", "formats", "runtime"},
     {"kernels"},
     {"model"},
@@ -99,7 +100,7 @@ def test_every_path_and_command_that_the_readme_names_exists():
     for name in re.findall(
         r"romandask (plan|run|status|report|ingest|\w+) ", " ".join(re.findall(r"^romandask .*$", text, re.M))
     ):
-        assert name in {"plan", "run", "status", "report", "ingest"}
+        assert name in {"plan", "run", "status", "report", "ingest", "export"}
 
 
 def test_ci_runs_the_test_command_of_the_readme():

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from astropy.wcs import WCS
 
-from romandask.formats.spectra import templates
+from romandask.formats.spectra import galaxy_templates
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman import Roman, RomanSettings
 from romandask.instruments.rubin import kolmogorov_transfer
@@ -208,10 +208,10 @@ def test_a_galaxy_agrees_with_galsim_through_spectra_lensing_and_the_exact_wcs()
         "size_minor_disk_true": 0.25, "position_angle_unlensed": 25.0, "bulge_magnorm": 21.0, "disk_magnorm": 21.0,
         "knots_magnorm": np.inf, "n_knots": 0,
         "bulge_av": 0.0, "bulge_rv": 3.1, "disk_av": 0.0, "disk_rv": 3.1, "MW_av": 0.0, "MW_rv": 3.1,
-        "bulge_sed": 0, "disk_sed": 3, "knots_sed": 3,
+        "bulge_sed": 0, "disk_sed": 3, "knots_sed": 3, "sed_val_bulge": [], "sed_val_disk": [], "sed_val_knots": [],
     }  # fmt: skip
     no_stars = pd.DataFrame({name: np.empty(0) for name in ("id", "ra", "dec", "magnorm", "sed", "MW_av", "MW_rv")})
-    library = templates(("CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im"), ())
+    library = galaxy_templates(("CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im"), 1)
     truth = bind(pd.DataFrame([row]), no_stars, library, (), "rest")
     scene = build_scene(truth, wcs, roman.bandpass("H158"), exposure.exptime, roman.knot_smoothing)
     image = draw(scene, roman.psf(exposure, 256), roman.shape, 0.01)[1200 - 48 : 1200 + 49, 3000 - 48 : 3000 + 49]

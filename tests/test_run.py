@@ -89,8 +89,10 @@ def test_a_rerun_has_nothing_to_do_and_a_changed_setting_makes_only_what_depends
 def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one_worker):
     arguments = [sys.executable, "-m", "romandask.cli", "run", "tiny", "--store", "s", "--workers", "1", *MINI]
     driver = subprocess.Popen(
-        arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        # what runs in the background has interrupts ignored, and so would its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
     deadline = time.monotonic() + 240
     while not (tmp_path / "s" / "manifest" / "pointings").exists():
         assert time.monotonic() < deadline

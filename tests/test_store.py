@@ -24,9 +24,8 @@ def images(count: int) -> ImageProduct:
 
     units = tuple(Unit(f"u{k}", k) for k in range(count))
     names = np.array([f"u{k}" for k in range(count)], object)
-    return ImageProduct(
-        "exposures/x", units, make, (PLANE,), ("exposure",), (count,), {"exposure": (("exposure",), names, {})}
-    )
+    coordinates = {"exposure": (("exposure",), names, {})}
+    return ImageProduct("exposures/x", units, make, (PLANE,), ("exposure",), (count,), lambda: coordinates)
 
 
 def test_images_come_back_and_grow_with_their_units(tmp_path):

@@ -10,7 +10,9 @@ from scipy.spatial import cKDTree
 
 import romandask as rd
 from romandask.flow import run_figures
+from romandask.formats.spectra import galaxy_templates
 from romandask.instruments.exposure import exposure_of
+from romandask.kernels.galaxies import STEPS, TEMPLATES
 from romandask.model.sky import ARCSEC, unit_vectors
 from romandask.runtime.store import Store
 
@@ -54,10 +56,11 @@ def test_the_stores_images_open_with_xarray_alone(tiny_store):
 def test_the_spectra_that_the_truth_names_are_stored(survey, tiny_store, truth):
     library = xr.open_zarr(tiny_store / "truth" / "seds.zarr", consolidated=False)
     used = truth["disk_sed"].dropna().astype(int)
-    assert set(library["sed"].values[used.unique()]) <= {"CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im"}
+    assert set(library["sed"].values[used.unique()]) <= set(galaxy_templates(TEMPLATES, STEPS).names)
     assert library["sed"].values[int(truth["sed"].dropna().iloc[0])].startswith("blackbody_")
     at_500 = library["photons"].interp(wave=500.0).values
-    np.testing.assert_allclose(at_500, 1.0, rtol=2e-3)
+    # cells are means: a line of a star or a galaxy may lie there
+    np.testing.assert_allclose(at_500, 1.0, rtol=2e-2)
 
 
 def test_single_rubin_exposures_are_there_for_the_asking(survey):

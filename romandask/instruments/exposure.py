@@ -54,6 +54,12 @@ def exposure_of(row: pd.Series) -> Exposure:
     return Exposure(**{name: kinds.get(name, float)(row[name]) for name in EXPOSURE_COLUMNS})
 
 
+def exposures_of(table: pd.DataFrame) -> list[Exposure]:
+    """Return the exposures of all rows of a pointings table."""
+    columns = [table[name].tolist() for name in EXPOSURE_COLUMNS]
+    return [Exposure(*values) for values in zip(*columns, strict=True)]
+
+
 class Instrument(Protocol):
     """A telescope and its camera, as the stages see it; one file a telescope."""
 
@@ -88,8 +94,15 @@ class Instrument(Protocol):
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
         """Return visits that cover a region: the columns of Exposure without the detector."""
 
-    def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
-        """Return the corners (4, 2) of at least those detectors of a visit that reach into a cone; degrees."""
+    @property
+    def detectors(self) -> tuple[int, ...]:
+        """Numbers of the detectors."""
+
+    def footprints(self, visits: pd.DataFrame) -> np.ndarray:
+        """Return the corners (n, detectors, 4, 2), degrees, of every detector of visits (columns ra, dec, pa)."""
+
+    def refused(self, visits: pd.DataFrame) -> np.ndarray:
+        """True where the telescope cannot point there and then (columns ra, dec, mjd)."""
 
     def header(self, exposure: Exposure) -> dict:
         """Return the exact FITS header of an exposure."""

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
 from pydantic import Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
+from romandask.instruments.rubin_cadence import cadence
 from romandask.kernels.bandpasses import rubin_bandpass
+from romandask.kernels.depth import SYSTEM_FWHM
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import PsfBasis, radial_basis
 from romandask.model.config import Section
-from romandask.model.seeds import rng
-from romandask.model.sky import Region, from_tangent_plane, unit_vectors
+from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
 SCALE = 0.2
@@ -24,12 +25,11 @@ AREA = np.pi / 4 * 642.3**2
 """Effective collecting area, cm2."""
 DARK = 0.2
 """Electrons a second."""
-SYSTEM_FWHM = 0.4
-"""Telescope and camera, arcsec at airmass 1."""
-FIELD_AREA = 9.6
-"""Field of view, square degrees."""
-SKY = {"u": 22.7, "g": 22.1, "r": 21.1, "i": 20.4, "z": 19.5, "y": 18.6}
-"""Median sky brightness, AB mag / arcsec2."""
+MARGIN = 0.3
+"""Degrees by which tiles may stick out of the region that they cover."""
+
+
+Band = Literal["u", "g", "r", "i", "z", "y"]
 
 
 class RubinPointings(Section):
@@ -38,7 +38,7 @@ class RubinPointings(Section):
     source: Literal["cadence", "opsim"] = "cadence"
     path: str | None = Field(None, description="OpSim SQLite file, below `data`")
     start: float = Field(60980.0, description="first night of the cadence, MJD")
-    visits: dict[str, int] = Field(
+    visits: dict[Band, Annotated[int, Field(ge=0, le=10_000)]] = Field(
         {"u": 28, "g": 40, "r": 92, "i": 92, "z": 80, "y": 80}, description="mean visits of a point, by band"
     )
     seeing: float = Field(0.6, gt=0, description="median atmospheric FWHM at 500 nm and zenith, arcsec")
@@ -47,7 +47,7 @@ class RubinPointings(Section):
 class RubinSettings(Section):
     """The Rubin block of a pipeline."""
 
-    bands: tuple[Literal["u", "g", "r", "i", "z", "y"], ...] = ("u", "g", "r", "i", "z", "y")
+    bands: tuple[Band, ...] = ("u", "g", "r", "i", "z", "y")
     mode: Literal["coadd"] = "coadd"
     pointings: RubinPointings = RubinPointings()
 
@@ -69,7 +69,8 @@ class Rubin:
     coadd_scale: float = SCALE
     pixel_scale: float = SCALE
     shape: tuple[int, int] = (4000, 4072)
-    field_radius: float = 1.9
+    detectors: tuple[int, ...] = tuple(range(189))
+    field_radius: float = 2.06
     knot_smoothing: float = 0.0
     aperture: float = 1.5
     detection: Literal["median", "mean"] = "mean"
@@ -87,51 +88,40 @@ class Rubin:
         return rubin_bandpass(band, self.n_waves, AREA)
 
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
-        """Return a generated cadence: a fixed field grid, nightly translational dithers, rotations at filter changes.
-
-        Visits of a field are spread over five years; seeing and airmass are log-normal and uniform in altitude, sky
-        brightness scatters by 0.3 mag about the band's median.
-        """
+        """Return a generated five-year cadence: a fixed field grid, dithers each night and at each filter change."""
         settings = self.settings.pointings
-        spacing = 2.8
-        rows = []
-        for field, ra, dec in _fields(region, spacing):
-            for band in self.bands:
-                random = rng(seed, "pointings", "rubin", field, band)
-                mean = settings.visits[band] * spacing**2 / FIELD_AREA
-                count = random.poisson(mean) if mean < 1 else int(round(mean))
-                if not count:
-                    continue
-                night = np.sort(random.integers(0, 5 * 365, count))
-                # uniform over the field's own cell, so that fields together cover the sky evenly
-                xi, eta = random.uniform(-spacing / 2, spacing / 2, (2, count))
-                centre_ra, centre_dec = from_tangent_plane(ra, dec, xi, eta)
-                rows.append(
-                    pd.DataFrame(
-                        {
-                            "band": band,
-                            "mjd": settings.start + night + random.uniform(0.1, 0.4, count),
-                            "exptime": 30.0,
-                            "ra": centre_ra,
-                            "dec": centre_dec,
-                            "pa": random.uniform(0, 360, count),
-                            "seeing": settings.seeing * np.exp(0.2 * random.standard_normal(count)),
-                            "airmass": 1 / np.cos(np.radians(random.uniform(5, 45, count))),
-                            "sky_brightness": SKY[band] + 0.3 * random.standard_normal(count),
-                        }
-                    )
-                )
-        visits = pd.concat(rows).sort_values(["mjd", "band"], ignore_index=True)
-        return visits.assign(visit=np.arange(len(visits)))
+        return cadence(
+            region,
+            seed,
+            bands=self.bands,
+            start=settings.start,
+            means={str(band): mean for band, mean in settings.visits.items()},
+            seeing=settings.seeing,
+            area=len(_CENTRES) * self.shape[0] * self.shape[1] * (SCALE / 3600) ** 2,
+            radius=self.field_radius + MARGIN,
+        )
 
-    def footprints(self, visit: Exposure, ra: float, dec: float, radius: float) -> dict[int, np.ndarray]:
-        """Return the corners of the 189 detectors of a visit, wherever the cone is: all at once they cost nothing."""
+    def refused(self, visits: pd.DataFrame) -> np.ndarray:
+        """True where a visit cannot be pointed: never, for a camera that only rotates about its boresight."""
+        return np.zeros(len(visits), bool)
+
+    def footprints(self, visits: pd.DataFrame) -> np.ndarray:
+        """Return the corners (n, 189, 4, 2), degrees, of the detectors of visits (ra, dec, pa; degrees), in order."""
         half = np.array(self.shape[::-1]) * SCALE / 2
-        x, y = (_CENTRES[:, None, :] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).transpose(2, 0, 1) / 3600
-        angle = np.radians(visit.pa)
-        xi, eta = -x * np.cos(angle) + y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
-        corners = np.stack(from_tangent_plane(visit.ra, visit.dec, xi, eta), axis=-1)
-        return dict(enumerate(corners))
+        corners = _CENTRES[:, None, :] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        x, y = np.radians(corners.reshape(-1, 2).T / 3600)
+        found = np.empty((len(visits), len(_CENTRES), 4, 2))
+        # in parts, for the vectors take more memory than the corners
+        for first in range(0, len(visits), 500):
+            part = slice(first, first + 500)
+            ra, dec, pa = (np.radians(visits[name].to_numpy(float)[part])[:, None] for name in ("ra", "dec", "pa"))
+            xi, eta = -x * np.cos(pa) + y * np.sin(pa), x * np.sin(pa) + y * np.cos(pa)
+            away, north = np.cos(dec) - eta * np.sin(dec), np.sin(dec) + eta * np.cos(dec)
+            # about the boresight's meridian
+            corner_ra = np.degrees(ra + np.arctan2(xi, away)) % 360
+            corner_dec = np.degrees(np.arctan2(north, np.hypot(xi, away)))
+            found[part] = np.stack([corner_ra, corner_dec], axis=-1).reshape(-1, len(_CENTRES), 4, 2)
+        return found
 
     def header(self, exposure: Exposure) -> dict:
         """Return the header of an exposure: gnomonic about the boresight, +y at the position angle `pa`."""
@@ -219,20 +209,3 @@ def _header(exposure: Exposure, detector: int, shape: tuple[int, int]) -> dict:
         "CD2_2": step * np.cos(angle),
         "RADESYS": "ICRS",
     }
-
-
-def _fields(region: Region, spacing: float) -> list[tuple[int, float, float]]:
-    """Return the fields (id, ra, dec) of a fixed all-sky grid whose dithered visits may reach the region."""
-    ra, dec = region.centre
-    rings = int(np.ceil(180 / spacing))
-    corner = unit_vectors([region.ra_min, region.ra_max], [region.dec_min, region.dec_max])
-    reach = np.degrees(np.arccos(np.clip(corner @ unit_vectors(ra, dec), -1, 1).min())) + spacing + 1.8
-    fields = []
-    for ring in range(rings):
-        ring_dec = -90 + (ring + 0.5) * 180 / rings
-        columns = max(1, int(round(360 * np.cos(np.radians(ring_dec)) / spacing)))
-        for column in range(columns):
-            ring_ra = (column + 0.5) * 360 / columns
-            if unit_vectors(ring_ra, ring_dec) @ unit_vectors(ra, dec) > np.cos(np.radians(min(reach, 180))):
-                fields.append((ring * 10_000 + column, ring_ra, ring_dec))
-    return fields

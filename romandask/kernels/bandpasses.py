@@ -9,10 +9,10 @@ import galsim
 import galsim.roman
 import numpy as np
 
-from romandask.model.spectra import Bandpass
+from romandask.model.spectra import LOG_STEP, Bandpass, cell_widths, log_grid
 
-SAMPLES = 240
-"""Midpoints a band: the quadrature error of CWW and top-hat spectra stays below 1e-3 mag."""
+SUBSAMPLES = 32
+"""Points a cell of the common grid: bandpasses are tabulated and have steep sides."""
 
 
 @lru_cache(maxsize=64)
@@ -35,12 +35,14 @@ def rubin_bandpass(band: str, n_waves: int, area: float) -> Bandpass:
 
 
 def sampled(name: str, bandpass: galsim.Bandpass, area: float, n_waves: int) -> Bandpass:
-    """Return a bandpass at the midpoints of equal steps, with PSF nodes from its blue to its red limit."""
-    edges = np.linspace(bandpass.blue_limit, bandpass.red_limit, SAMPLES + 1)
-    middle = (edges[1:] + edges[:-1]) / 2
-    # mean over each step, not the midpoint value: bandpasses are tabulated and have steep sides
-    fine = edges[:-1, None] + (edges[1] - edges[0]) * (np.arange(8) + 0.5)[None] / 8
+    """Return a bandpass as means over cells of the common grid, with PSF nodes from its blue to its red limit."""
+    wave = log_grid(bandpass.blue_limit, bandpass.red_limit)
+    widths = cell_widths(wave)
+    fine = wave[:, None] * np.exp(LOG_STEP * ((np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5))
+    inside = (fine >= bandpass.blue_limit) & (fine <= bandpass.red_limit)
+    throughput = np.where(inside, bandpass(np.clip(fine, bandpass.blue_limit, bandpass.red_limit)), 0.0)
+    steps = fine * LOG_STEP / SUBSAMPLES
     # tails below a thousandth of the peak hold light but would only spread the nodes
     trimmed = bandpass.truncate(relative_throughput=1e-3)
     nodes = np.linspace(trimmed.blue_limit, trimmed.red_limit, n_waves)
-    return Bandpass(name, middle, np.asarray(bandpass(fine.ravel())).reshape(fine.shape).mean(axis=1), area, nodes)
+    return Bandpass(name, wave, (throughput * steps).sum(axis=1) / widths, area, nodes)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.kernels.photometry import Spectra, node_photons
+from romandask.kernels.photometry import Dust, Spectra, no_dust, node_photons
 from romandask.kernels.render import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, Scene
-from romandask.model.spectra import Bandpass
+from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra
 
 COMPONENTS = ("bulge", "disk", "knots")
 
@@ -28,6 +28,31 @@ class Truth:
     """"rest" or "observed": where the galaxies' own dust acts."""
 
 
+def bind(
+    galaxies: pd.DataFrame, stars: pd.DataFrame, library: SpectrumLibrary, edges: tuple[float, ...], frame: str
+) -> Truth:
+    """Return rows together with the spectra they refer to."""
+    return Truth(
+        galaxies,
+        stars,
+        {component: component_spectra(galaxies, component, library, edges) for component in COMPONENTS},
+        LibrarySpectra(library, stars["sed"].to_numpy(int)),
+        frame,
+    )
+
+
+def component_spectra(
+    galaxies: pd.DataFrame, component: str, library: SpectrumLibrary, edges: tuple[float, ...]
+) -> Spectra:
+    """Return the spectra of a component: top-hats where the rows hold any, else those of the library."""
+    bins = galaxies[f"sed_val_{component}"]
+    if not any(len(row) for row in bins):
+        return LibrarySpectra(library, galaxies[f"{component}_sed"].to_numpy(int))
+    # a component without light may have no spectrum
+    dark = np.zeros(len(edges) - 1)
+    return TophatSpectra(np.stack([row if len(row) else dark for row in bins]).astype(float), np.array(edges))
+
+
 def magnification(galaxies: pd.DataFrame) -> np.ndarray:
     """Return mu = 1 / ((1 - kappa)^2 - gamma^2) of each galaxy."""
     shear2 = galaxies["shear_1"] ** 2 + galaxies["shear_2"] ** 2
@@ -42,10 +67,8 @@ def galaxy_photons(truth: Truth, bandpass: Bandpass, component: str) -> np.ndarr
         rows[f"{component}_magnorm"].to_numpy(float),
         truth.galaxy_spectra[component],
         rows["redshift"].to_numpy(float),
-        rows[f"{dust}_av"].to_numpy(float),
-        rows[f"{dust}_rv"].to_numpy(float),
-        rows["MW_av"].to_numpy(float),
-        rows["MW_rv"].to_numpy(float),
+        Dust(rows[f"{dust}_av"].to_numpy(float), rows[f"{dust}_rv"].to_numpy(float)),
+        Dust(rows["MW_av"].to_numpy(float), rows["MW_rv"].to_numpy(float)),
         bandpass,
         truth.internal_frame,
     )
@@ -55,15 +78,12 @@ def galaxy_photons(truth: Truth, bandpass: Bandpass, component: str) -> np.ndarr
 def star_photons(truth: Truth, bandpass: Bandpass) -> np.ndarray:
     """Return photons per second (n, nodes) of the stars."""
     rows = truth.stars
-    none = np.zeros(len(rows))
     return node_photons(
         rows["magnorm"].to_numpy(float),
         truth.star_spectra,
-        none,
-        none,
-        none,
-        rows["MW_av"].to_numpy(float),
-        rows["MW_rv"].to_numpy(float),
+        np.zeros(len(rows)),
+        no_dust(len(rows)),
+        Dust(rows["MW_av"].to_numpy(float), rows["MW_rv"].to_numpy(float)),
         bandpass,
     )
 

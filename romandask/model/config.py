@@ -11,6 +11,7 @@ import typing
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -44,24 +45,49 @@ class RegionSettings(Section):
         return Region(self.ra[0], self.ra[1], self.dec[0], self.dec[1])
 
 
+class TableSettings(Section):
+    """A Parquet or FITS table of galaxies or of stars."""
+
+    path: str = Field(description="file, or folder of Parquet files, below `data`")
+    columns: dict[str, float | str] = Field(
+        description="by column of ours the file's column, a number for all rows, or a text after '='"
+    )
+
+
 class TruthSettings(Section):
     """Where galaxies and stars come from."""
 
-    source: Literal["generate", "skycatalogs"] = "generate"
-    path: str | None = Field(None, description="folder of the source catalog, below `data`")
+    source: Literal["generate", "skycatalogs", "instance_catalog", "table"] = "generate"
+    path: str | None = Field(None, description="folder or file of the source catalog, below `data`")
+    galaxy_table: TableSettings | None = Field(None, description="galaxies, with source: table")
+    star_table: TableSettings | None = Field(None, description="stars, with source: table")
     seds: str | None = Field(None, description="folder of spectra that the catalog names, below `data`")
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
     margin: float = Field(20.0, ge=0, description="objects this far outside the region are kept, arcsec")
     galaxies: float = Field(597.2, ge=0, description="galaxies to r < 29, per square arcminute")
     stars: float = Field(3.96, ge=0, description="stars to r < 29, per square arcminute")
+    star_seds: str | None = Field(
+        None, description="folder of spectra for generated stars, below `data`; blackbodies where there is none"
+    )
+    nside: Literal[64, 128, 256, 512, 1024, 2048, 4096] = Field(
+        1024, description="HEALPix resolution of the matter shells, power of two"
+    )
+    shear: tuple[float, float] = Field(
+        (0.0, 0.0), description="constant shear (gamma_1, gamma_2) added to the generated universe, all else the same"
+    )
+    milky_way_av: float = Field(0.03, ge=0, le=3, description="A_V of the Milky Way before generated objects, mag")
     dust: Literal["physical", "troxel2023"] = Field(
         "physical", description="internal dust in the rest frame, or in the observed frame as the paper did"
     )
 
     @model_validator(mode="after")
     def _has_path(self) -> TruthSettings:
-        if self.source != "generate" and not self.path:
+        if self.source in ("skycatalogs", "instance_catalog") and not self.path:
             raise ValueError(f"truth.path is needed with source: {self.source}")
+        if self.source == "table" and self.galaxy_table is None and self.star_table is None:
+            raise ValueError("truth.galaxy_table or truth.star_table is needed with source: table")
+        if np.hypot(*self.shear) > 0.2:
+            raise ValueError(f"truth.shear {self.shear} is beyond the weak regime: at most 0.2")
         return self
 
 

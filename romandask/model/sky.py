@@ -12,6 +12,10 @@ from scipy.spatial import cKDTree
 
 ARCSEC = np.pi / 180 / 3600
 """One arcsecond in radians."""
+_PAIRS = 200_000
+"""Pairs of polygons that are compared at a time: some tens of megabytes."""
+_FOOTPRINTS = 20_000
+"""Footprints that positions are compared with at a time."""
 
 
 def unit_vectors(ra, dec) -> np.ndarray:
@@ -57,15 +61,42 @@ def touching_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
         return np.empty(0, int), np.empty(0, int)
     centre_a, radius_a = _caps(a)
     centre_b, radius_b = _caps(b)
-    near = cKDTree(centre_b).query_ball_point(centre_a, radius_a + radius_b.max())
-    i = np.repeat(np.arange(len(a)), [len(found) for found in near])
-    j = np.array([k for found in near for k in found], dtype=int)
-    keep = np.linalg.norm(centre_a[i] - centre_b[j], axis=1) <= radius_a[i] + radius_b[j]
+    near = cKDTree(centre_a).sparse_distance_matrix(
+        cKDTree(centre_b), radius_a.max() + radius_b.max() + 1e-12, output_type="ndarray"
+    )
+    i, j = near["i"], near["j"]
+    keep = near["v"] <= radius_a[i] + radius_b[j] + 1e-12
     i, j = i[keep], j[keep]
-    keep = ~(_outside(a[i], b[j]) | _outside(b[j], a[i]))
-    i, j = i[keep], j[keep]
+    touching = np.ones(len(i), bool)
+    for start in range(0, len(i), _PAIRS):
+        part = slice(start, start + _PAIRS)
+        touching[part] = ~(_outside(a[i[part]], b[j[part]]) | _outside(b[j[part]], a[i[part]]))
+    i, j = i[touching], j[touching]
     order = np.lexsort((j, i))
     return i[order], j[order]
+
+
+def covering_sums(footprints: np.ndarray, ra, dec, weights: np.ndarray | None = None) -> np.ndarray:
+    """Return, for positions in degrees, the sum of the weights (n,), or the number, of the footprints over them.
+
+    Footprints (n, 4, 2), degrees, are convex and much smaller than the sky; edges are arcs of great circles.
+    """
+    ra, dec = np.broadcast_arrays(np.asarray(ra, float), np.asarray(dec, float))
+    points = unit_vectors(ra.ravel(), dec.ravel())
+    sums = np.zeros(len(points))
+    tree = cKDTree(points) if len(points) else None
+    for start in range(0, len(footprints) if tree is not None else 0, _FOOTPRINTS):
+        part = slice(start, start + _FOOTPRINTS)
+        corners = unit_vectors(footprints[part, :, 0], footprints[part, :, 1])
+        middle, radius = _caps(corners)
+        near = cKDTree(middle).sparse_distance_matrix(tree, radius.max() + chord(1.0), output_type="ndarray")
+        which, point = near["i"], near["j"]
+        normals = np.cross(corners, np.roll(corners, -1, axis=1))
+        normals *= np.sign(np.einsum("nkc,nc->nk", normals, middle))[..., None]
+        inside = (np.einsum("pkc,pc->pk", normals[which], points[point]) >= 0).all(axis=1)
+        share = np.ones(len(middle)) if weights is None else np.asarray(weights, float)[part]
+        sums += np.bincount(point[inside], weights=share[which[inside]], minlength=len(points))
+    return sums.reshape(ra.shape)
 
 
 def _caps(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,6 +170,27 @@ class Region:
         return np.sort(cells[inside].astype(np.int64))
 
 
+@dataclass(frozen=True)
+class Cone:
+    """All positions within an angle of one."""
+
+    ra: float
+    """degrees"""
+    dec: float
+    """degrees"""
+    radius: float
+    """arcsec"""
+
+    def contains(self, ra, dec) -> np.ndarray:
+        """True where a position (degrees) lies inside or on the edge."""
+        gap = np.linalg.norm(unit_vectors(ra, dec) - unit_vectors(self.ra, self.dec), axis=-1)
+        return gap <= chord(self.radius)
+
+    def cells(self, order: int) -> np.ndarray:
+        """Return the HEALPix cells (nested, `order`) that may touch the cone, sorted."""
+        return cells_in_cone(self.ra, self.dec, self.radius / 3600, order)
+
+
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> np.ndarray:
     """Return the HEALPix cells (nested) that may touch a cone; all angles in degrees."""
     lon, lat = Longitude(ra * u.deg), Latitude(dec * u.deg)
@@ -155,3 +207,12 @@ def cell_of(ra, dec, order: int) -> np.ndarray:
 def cell_area(order: int) -> float:
     """Return the area of a HEALPix cell, square arcminutes."""
     return 4 * np.pi * (180 * 60 / np.pi) ** 2 / (12 * 4**order)
+
+
+def displaced(ra, dec, angle, bearing) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (degrees) an `angle` away along a great circle that leaves at `bearing`, both radians."""
+    a, d = np.radians(ra), np.radians(dec)
+    height = np.sin(d) * np.cos(angle) + np.cos(d) * np.sin(angle) * np.cos(bearing)
+    east = np.sin(bearing) * np.sin(angle) * np.cos(d)
+    turn = np.arctan2(east, np.cos(angle) - np.sin(d) * height)
+    return np.degrees(a + turn) % 360, np.degrees(np.arcsin(np.clip(height, -1, 1)))

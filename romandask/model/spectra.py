@@ -16,13 +16,29 @@ MAGNORM_WAVE = 500.0
 """Wavelength, nm, of the rest-frame top-hat that `magnorm` refers to."""
 
 
+LOG_STEP = 1e-3
+"""Step in ln(wavelength) of every spectrum and bandpass: cell j holds wavelengths around exp(j LOG_STEP) nm, so that a
+redshift moves a spectrum by one and the same number of cells everywhere."""
+
+
+def log_grid(low: float, high: float) -> np.ndarray:
+    """Return the centres, nm, of the cells from that of `low` to that of `high`, both included."""
+    first, last = (int(round(np.log(value) / LOG_STEP)) for value in (low, high))
+    return np.exp(np.arange(first, last + 1) * LOG_STEP)
+
+
+def cell_widths(wave: np.ndarray) -> np.ndarray:
+    """Return the widths, nm, of cells with these centres."""
+    return wave * 2 * np.sinh(LOG_STEP / 2)
+
+
 @dataclass(frozen=True)
 class Bandpass:
-    """A bandpass sampled at the midpoints of equal steps, ready for quadrature."""
+    """A bandpass as means over the cells of the common grid, ready for quadrature."""
 
     name: str
     wave: np.ndarray
-    """(n,) nm, midpoints."""
+    """(n,) nm, centres of cells of the common grid."""
     throughput: np.ndarray
     """(n,) effective area over `area`, dimensionless."""
     area: float
@@ -31,18 +47,23 @@ class Bandpass:
     """(k,) nm: wavelengths at which the PSF is known; between them it is interpolated linearly."""
 
     @property
-    def step(self) -> float:
-        """Width of a sample, nm."""
-        return float(self.wave[1] - self.wave[0])
+    def first(self) -> int:
+        """Number of the first cell."""
+        return int(round(np.log(self.wave[0]) / LOG_STEP))
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(n,) cm2 nm: photons per second of a photon density of one per second, cm2 and nm in that cell alone."""
+        return self.throughput * cell_widths(self.wave) * self.area
 
     def node_weights(self) -> np.ndarray:
-        """Return (n, k): the share of each sample's photons that goes to each PSF node; rows sum to one."""
+        """Return (n, k): the share of each cell's photons that goes to each PSF node; rows sum to one."""
         position = np.interp(self.wave, self.nodes, np.arange(len(self.nodes)))
         return np.clip(1 - np.abs(position[:, None] - np.arange(len(self.nodes))), 0, 1)
 
     def ab_photons(self) -> float:
         """Return the photons a second of a source of AB magnitude 0 (flat f_nu = 3631 Jy)."""
-        return float((ab_photon_density(self.wave) * self.throughput).sum() * self.step * self.area)
+        return float(ab_photon_density(self.wave) @ self.weights)
 
 
 def ab_photon_density(wave: np.ndarray) -> np.ndarray:
@@ -53,28 +74,20 @@ def ab_photon_density(wave: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SpectrumLibrary:
-    """Spectra by index, on one wavelength grid, as photon densities relative to that at 500 nm rest frame."""
+    """Spectra by index, on the common grid, as photon densities relative to that at 500 nm rest frame."""
 
     names: tuple[str, ...]
     wave: np.ndarray
-    """(n,) nm, rest frame, equally spaced in log."""
+    """(n,) nm, rest frame, cells of the common grid; beyond either end there is no light."""
     photons: np.ndarray
     """(s, n) photons per nm, 1 at 500 nm."""
+    limits: np.ndarray
+    """(s, 2) nm: where each spectrum is known."""
 
-    def evaluate(self, index: np.ndarray, wave: np.ndarray) -> np.ndarray:
-        """Return photon densities (objects, samples) of spectra `index` at rest-frame wavelengths `wave`.
-
-        Beyond either end of the grid the spectrum is zero.
-        """
-        log0, step = np.log(self.wave[0]), np.log(self.wave[1] / self.wave[0])
-        position = (np.log(wave) - log0) / step
-        low = np.clip(position.astype(np.int64), 0, len(self.wave) - 2)
-        share = position - low
-        rows = np.asarray(index)[:, None]
-        if rows.size and rows.min() < 0:
-            raise ValueError("an object without a spectrum cannot have light")
-        value = self.photons[rows, low] * (1 - share) + self.photons[rows, low + 1] * share
-        return np.where((position >= 0) & (position <= len(self.wave) - 1), value, 0.0)
+    @property
+    def first(self) -> int:
+        """Number of the first cell."""
+        return int(round(np.log(self.wave[0]) / LOG_STEP))
 
 
 @dataclass(frozen=True)
@@ -85,23 +98,20 @@ class LibrarySpectra:
     index: np.ndarray
     """(n,)"""
 
-    def density(self, rows: np.ndarray, wave: np.ndarray) -> np.ndarray:
-        """Return photon densities (rows, samples), 1 at 500 nm, at rest-frame wavelengths in nm."""
-        return self.library.evaluate(self.index[rows], wave)
-
 
 @dataclass(frozen=True)
 class TophatSpectra:
-    """Top-hat spectra of a table's objects (cosmoDC2)."""
+    """Top-hat spectra of a table's objects (cosmoDC2).
+
+    Within a bin f_lambda is constant, L_nu times the bin's width in frequency over its width in wavelength, as
+    skyCatalogs has it. Beyond the last bin the last value of L_nu is continued (to low redshift the catalog ends short
+    of F184's red edge); below the first bin there is no light.
+    """
 
     values: np.ndarray
-    """(n, bins) L_nu, any unit."""
+    """(n, bins) L_nu, any unit; an object without light has zeros."""
     edges: np.ndarray
-    """(bins + 1,) nm."""
-
-    def density(self, rows: np.ndarray, wave: np.ndarray) -> np.ndarray:
-        """Return photon densities (rows, samples), 1 at 500 nm, at rest-frame wavelengths in nm."""
-        return tophat_photons(self.values[rows], self.edges, wave)
+    """(bins + 1,) nm, rest frame."""
 
 
 def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]], grid: np.ndarray) -> SpectrumLibrary:
@@ -116,37 +126,24 @@ def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]],
     for row, name, (wave, flambda) in zip(rows, names, spectra, strict=True):
         # between samples the photon density is linear, as GalSim has it; templates are coarse enough for it to matter
         photons = np.asarray(flambda) * wave
-        at_500 = np.interp(MAGNORM_WAVE, wave, photons)
+        # magnorm is through a top-hat of 1 Angstrom, which matters among the lines of cool stars
+        at_500 = np.interp(MAGNORM_WAVE + np.linspace(-0.05, 0.05, 41), wave, photons).mean()
         if not at_500 > 0:
             raise ValueError(f"spectrum {name} has no light at 500 nm, where magnorm is defined")
-        row[:] = np.interp(grid, wave, photons, left=0.0, right=0.0) / at_500
-    return SpectrumLibrary(tuple(names), grid, rows)
+        row[:] = _cell_means(np.asarray(wave, float), photons, grid) / at_500
+    limits = np.array([[wave.min(), wave.max()] for wave, _ in spectra]).reshape(-1, 2)
+    return SpectrumLibrary(tuple(names), grid, rows, limits)
+
+
+def _cell_means(wave: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return the means over cells of values that are linear between samples and zero beyond: stars have finer lines."""
+    edges = np.concatenate([grid, grid[-1:] * np.exp(LOG_STEP)]) * np.exp(-LOG_STEP / 2)
+    nodes = np.union1d(wave, edges)
+    at = np.interp(nodes, wave, values, left=0.0, right=0.0)
+    total = np.concatenate([[0.0], np.cumsum((at[1:] + at[:-1]) / 2 * np.diff(nodes))])
+    return np.diff(total[np.searchsorted(nodes, edges)]) / np.diff(edges)
 
 
 def default_grid() -> np.ndarray:
-    """Return the rest-frame grid of libraries: 60 nm to 2600 nm in steps of 0.1 per cent."""
-    return np.exp(np.arange(np.log(60.0), np.log(2600.0), 1e-3))
-
-
-def tophat_photons(values: np.ndarray, edges: np.ndarray, wave: np.ndarray) -> np.ndarray:
-    """Return photon densities (objects, samples), 1 at 500 nm, of top-hat spectra (cosmoDC2).
-
-    Parameters
-    ----------
-    values : (objects, bins) luminosity L_nu per bin, any unit; an object without light has zeros
-    edges : (bins + 1,) nm, rest frame
-    wave : (objects, samples) nm, rest frame
-
-    Within a bin f_lambda is constant, L_nu times the bin's width in frequency over its width in wavelength, as
-    skyCatalogs has it. Beyond the last bin the last value of L_nu is continued (to low redshift the catalog
-    ends short of F184's red edge); below the first bin there is no light.
-    """
-    inverse = 1 / edges
-    flambda = values * (inverse[:-1] - inverse[1:]) / (edges[1:] - edges[:-1])
-    reference = np.searchsorted(edges, MAGNORM_WAVE, side="right") - 1
-    norm = np.where(values[:, reference] > 0, values[:, reference] / MAGNORM_WAVE**2, 1.0)
-    bins = np.searchsorted(edges, wave, side="right") - 1
-    inside = np.take_along_axis(flambda, np.clip(bins, 0, len(edges) - 2), axis=1)
-    beyond = values[:, -1:] / wave**2
-    density = np.where(bins > len(edges) - 2, beyond, np.where(bins < 0, 0.0, inside))
-    return density / norm[:, None] * wave / MAGNORM_WAVE
+    """Return the rest-frame grid of libraries: 60 nm to 2600 nm."""
+    return log_grid(60.0, 2600.0)

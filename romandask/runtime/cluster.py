@@ -88,7 +88,7 @@ class OnCluster:
             while waiting and len(futures) < room:
                 task = waiting.pop()
                 tries[task.index] += 1
-                key = f"{name}-{product.units[task.index].name}-{token}-{tries[task.index]}"
+                key = f"{name}-{product.names[task.index]}-{token}-{tries[task.index]}"
                 future = self._client.submit(make_unit, shared, task, store, key=key, pure=False)
                 futures[future] = task
                 future.add_done_callback(ended.put)

@@ -1,16 +1,28 @@
-"""HATS catalogs: the files beside the partitions that let pandas, pyarrow, hats and LSDB read them."""
+"""HATS collections: catalogs with margins, and the files that let pandas, pyarrow, hats and LSDB read them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
+import cdshealpix.nested as healpix
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from hats.catalog import CatalogType, TableProperties
+from hats.catalog.dataset.collection_properties import CollectionProperties
 from hats.pixel_math.spatial_index import SPATIAL_INDEX_COLUMN, compute_spatial_index
 
 from romandask.runtime.manifest import read_record
 from romandask.runtime.products import TableProduct
-from romandask.runtime.store import Store, write_bytes
+from romandask.runtime.store import MARGIN, Store, write_bytes
+from romandask.runtime.units import LazyUnits, Unit
+
+WIDTH = 10.0
+"""Rows this near to a partition, arcsec, are in its margin: further than any linking length in use."""
+RIM_ORDER = 13
+"""HEALPix order of the cells around a partition that make its margin: 26 arcsec wide, 18 where they are flattest."""
 
 
 def with_spatial_index(frame: pd.DataFrame, ra: str = "ra", dec: str = "dec") -> pd.DataFrame:
@@ -21,12 +33,65 @@ def with_spatial_index(frame: pd.DataFrame, ra: str = "ra", dec: str = "dec") ->
     )
 
 
+def margin(product: TableProduct) -> TableProduct:
+    """Return the margin of a catalog: for each partition the rows of others around it, within WIDTH at least."""
+    order, pixels = product.order or 0, np.array(product.pixels or (), np.int64)
+    rims = [_rim(pixel, order) for pixel in pixels.tolist()]
+    around = [product.touching(np.unique(rim >> (2 * (RIM_ORDER - order)))) for rim in rims]
+
+    def unit(index: int) -> Unit:
+        inputs = tuple((product.stage, product.names[k]) for k in around[index])
+        return Unit(product.names[index], {"width": WIDTH, "rim": RIM_ORDER}, inputs)
+
+    return TableProduct(
+        product.stage + MARGIN,
+        LazyUnits(product.names, unit),
+        _MakeMargin(product, tuple(map(tuple, around)), order),
+        product.schema,
+        product.pixels,
+        product.order,
+        product.bytes_per_unit,
+        0.05 * product.seconds_per_unit,
+        product.store,
+    )
+
+
+@dataclass(frozen=True)
+class _MakeMargin:
+    product: TableProduct
+    around: tuple[tuple[int, ...], ...]
+    order: int
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        rim = _rim((self.product.pixels or ())[index], self.order)
+        shift = 2 * (29 - RIM_ORDER)
+        parts = []
+        for k in self.around[index]:
+            own = rim[rim >> (2 * (RIM_ORDER - self.order)) == (self.product.pixels or ())[k]]
+            near = self.product.select(k, None, (int(own.min()) << shift, (int(own.max()) + 1) << shift))
+            parts.append(near[np.isin(near[SPATIAL_INDEX_COLUMN].to_numpy() >> shift, own)])
+        filled = [part for part in parts if len(part)]
+        if not filled:
+            return self.product.empty()
+        return pd.concat(filled).sort_values(SPATIAL_INDEX_COLUMN, kind="stable", ignore_index=True)
+
+
+def _rim(pixel: int, order: int) -> np.ndarray:
+    """Return the cells of RIM_ORDER that lie along the outside of a cell, corners included."""
+    edges, corners = healpix.external_neighbours(np.array([pixel], np.uint64), order, RIM_ORDER - order)
+    found = np.concatenate([np.ravel(edges), np.ravel(corners)]).astype(np.int64)
+    return np.unique(found[found >= 0])
+
+
 def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec: str = "dec") -> None:
-    """Write hats.properties, partition_info.csv, dataset/_metadata and dataset/_common_metadata of a stored catalog."""
+    """Write hats.properties, partition_info.csv, dataset/_metadata and dataset/_common_metadata of a stored catalog.
+
+    With the margin's, written after the catalog's own, comes collection.properties.
+    """
     root = store.catalog(product.stage)
     rows, metadata, present = 0, None, []
-    for unit, pixel in zip(product.units, product.pixels or (), strict=True):
-        record = read_record(store, product.stage, unit.name)
+    for name, pixel in zip(product.names, product.pixels or (), strict=True):
+        record = read_record(store, product.stage, name)
         if record is None or record.rows == 0:
             continue
         path = store.partition(product.stage, product.order or 0, pixel)
@@ -49,7 +114,7 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
             content.write_metadata_file(sink)
         write_bytes(root / "dataset" / name, sink.getvalue().to_pybytes())
     # validated from a mapping: the model's own signature does not tell its optional fields
-    content = dict(
+    properties = dict(
         obs_collection=product.stage.replace("/", "_"),
         dataproduct_type=CatalogType.OBJECT,
         hats_nrows=rows,
@@ -58,7 +123,20 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
         hats_col_healpix=SPATIAL_INDEX_COLUMN,
         hats_col_healpix_order=29,
     )
-    TableProperties.model_validate(content).to_properties_file(root)
+    if product.stage.endswith(MARGIN):
+        primary = product.stage.removesuffix(MARGIN).replace("/", "_")
+        properties |= dict(
+            dataproduct_type=CatalogType.MARGIN, hats_primary_table_url=primary, hats_margin_threshold=WIDTH
+        )
+        _write_collection(store.collection(product.stage), primary)
+    TableProperties.model_validate(properties).to_properties_file(root)
+
+
+def _write_collection(folder: Path, name: str) -> None:
+    content = dict(
+        obs_collection=name, hats_primary_table_url="catalog", all_margins=["margin"], default_margin="margin"
+    )
+    CollectionProperties.model_validate(content).to_properties_file(folder)
 
 
 def _drop_strays(product: TableProduct, store: Store, present: set[int]) -> None:

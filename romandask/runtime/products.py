@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -17,22 +17,13 @@ import xarray as xr
 import zarr
 
 from romandask.model.errors import UserError
+from romandask.model.sky import Cone, Region
 from romandask.runtime.manifest import digest, read_record
 from romandask.runtime.store import Store, Variable, open_images, read_parquet, write_coordinate, write_parquet
+from romandask.runtime.units import Unit, names_of
 
-
-@dataclass(frozen=True)
-class Unit:
-    """One thing that a stage makes."""
-
-    name: str
-    """Unique within the stage; also its file name."""
-    settings: Any
-    """Everything but upstream units that its content depends on, as values that JSON can hold."""
-    inputs: tuple[tuple[str, str], ...] = ()
-    """(stage, unit) of the upstream units that it reads."""
-    cost: float = 1.0
-    """Relative time, so that long units go first."""
+Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
+"""By name: axes, values, attributes."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +42,7 @@ class ImageProduct:
 
     stage: str
     """For example exposures/roman; also its place in the store."""
-    units: tuple[Unit, ...]
+    units: Sequence[Unit]
     make: Callable[[int], dict[str, np.ndarray]]
     """Makes the arrays of one unit."""
     variables: tuple[Variable, ...]
@@ -59,11 +50,19 @@ class ImageProduct:
     """Names of the axes over units."""
     lengths: tuple[int, ...]
     """Their lengths; units are in C order."""
-    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
+    coordinates: Callable[[], Coordinates]
+    """Values along the axes; asked for only when images are, for headers of many exposures take their time."""
     attributes: dict[str, Any] = field(default_factory=dict)
     bytes_per_unit: int = 0
     """Peak memory, bytes, of making one unit beyond the interpreter."""
+    seconds_per_unit: float = 0.0
+    """Time, seconds of a core as measured on a laptop, of making one unit: for plans."""
     store: Store | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the units."""
+        return names_of(self.units)
 
     def stored(self, store: Store) -> ImageProduct:
         """Return the same product, reading what the store has."""
@@ -71,7 +70,7 @@ class ImageProduct:
 
     def load(self, index: int, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
         """Return the arrays of a unit: read where the manifest has it, made where not."""
-        if self.store is not None and read_record(self.store, self.stage, self.units[index].name):
+        if self.store is not None and read_record(self.store, self.stage, self.names[index]):
             group = zarr.open_group(self.store.images(self.stage), mode="r")
             place = np.unravel_index(index, self.lengths)
             wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
@@ -83,7 +82,7 @@ class ImageProduct:
         if not self.units:
             return
         group = open_images(store.images(self.stage), self.variables, self.lengths, self.axes)
-        for name, (axes, values, attributes) in self.coordinates.items():
+        for name, (axes, values, attributes) in self.coordinates().items():
             write_coordinate(group, name, values, axes, attributes)
         group.attrs.update(self.attributes)
 
@@ -96,7 +95,7 @@ class ImageProduct:
             array = arrays[variable.name]
             if array.shape != variable.shape or not np.isfinite(array).all():
                 raise ValueError(
-                    f"{self.stage} {self.units[index].name}: {variable.name} has shape {array.shape}, expected "
+                    f"{self.stage} {self.names[index]}: {variable.name} has shape {array.shape}, expected "
                     f"{variable.shape}, or values that are not finite"
                 )
             _array(group, variable.name)[place] = array.astype(variable.dtype, copy=False)
@@ -131,7 +130,7 @@ class ImageProduct:
             )
         coordinates = {
             key: (axes, values.astype(str) if values.dtype == object else values, attributes)
-            for key, (axes, values, attributes) in self.coordinates.items()
+            for key, (axes, values, attributes) in self.coordinates().items()
         }
         return xr.Dataset(data, coordinates, self.attributes)
 
@@ -157,14 +156,20 @@ class TableProduct:
     """A table over units, HEALPix partitions or others; `frame` is the lazy dask DataFrame."""
 
     stage: str
-    units: tuple[Unit, ...]
+    units: Sequence[Unit]
     make: Callable[[int], pd.DataFrame]
     schema: pa.Schema
     pixels: tuple[int, ...] | None = None
     """HEALPix cell of each unit where the product is a HATS catalog."""
     order: int | None = None
     bytes_per_unit: int = 0
+    seconds_per_unit: float = 0.0
     store: Store | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the units."""
+        return names_of(self.units)
 
     def stored(self, store: Store) -> TableProduct:
         """Return the same product, reading what the store has."""
@@ -172,11 +177,44 @@ class TableProduct:
 
     def load(self, index: int) -> pd.DataFrame:
         """Return the rows of a unit: read where the manifest has it, made where not."""
-        if self.store is not None and (record := read_record(self.store, self.stage, self.units[index].name)):
+        if self.store is not None and (record := read_record(self.store, self.stage, self.names[index])):
             if record.rows == 0:
                 return to_frame(self.schema.empty_table())
             return to_frame(read_parquet(self._path(index, self.store)))
         return to_frame(conform(self.make(index), self.schema, self.stage))
+
+    def has(self, index: int) -> bool:
+        """True where the store has a unit."""
+        return self.store is not None and read_record(self.store, self.stage, self.names[index]) is not None
+
+    def select(
+        self, index: int, columns: list[str] | None = None, between: tuple[int, int] | None = None
+    ) -> pd.DataFrame:
+        """Return some columns of a unit's rows, and of rows those whose _healpix_29 lies in low <= cell < high.
+
+        Of a stored unit only the parts of the file are read that may hold them.
+        """
+        if self.store is not None and (record := read_record(self.store, self.stage, self.names[index])):
+            if record.rows:
+                return to_frame(read_parquet(self._path(index, self.store), columns, between))
+            frame = self.empty()
+        else:
+            frame = self.load(index)
+        if between is not None:
+            frame = frame[(frame["_healpix_29"] >= between[0]) & (frame["_healpix_29"] < between[1])]
+        return frame if columns is None else frame[columns]
+
+    def touching(self, cells: np.ndarray) -> list[int]:
+        """Return the units whose HEALPix cells (of the catalog's own order) are among some."""
+        return sorted(self._places[cell] for cell in np.asarray(cells).tolist() if cell in self._places)
+
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        return {pixel: index for index, pixel in enumerate(self.pixels or ())}
+
+    def empty(self) -> pd.DataFrame:
+        """Return no rows, with the right columns."""
+        return to_frame(self.schema.empty_table())
 
     def prepare(self, store: Store) -> None:
         """Tables need nothing before their units are written."""
@@ -193,10 +231,24 @@ class TableProduct:
     @property
     def frame(self) -> dd.DataFrame:
         """The lazy table, a partition a unit."""
-        meta = to_frame(self.schema.empty_table())
-        if not self.units:
+        meta = _with_lists(self.empty(), self.schema)
+        if not len(self.units):
             return dd.from_pandas(meta, npartitions=1)
         return dd.from_map(_LoadPartition(self), range(len(self.units)), meta=meta, label=self.stage.replace("/", "-"))
+
+    def within(self, region: Region | Cone, ra: str = "ra", dec: str = "dec") -> dd.DataFrame:
+        """Return the lazy rows of a region, of the partitions alone that it touches."""
+        chosen = self.touching(region.cells(self.order or 0))
+        if not chosen:
+            return dd.from_pandas(_with_lists(self.empty(), self.schema), npartitions=1)
+        load = _LoadWithin(self, region, ra, dec)
+        meta = _with_lists(self.empty(), self.schema)
+        return dd.from_map(load, chosen, meta=meta, label=f"{self.stage.replace('/', '-')}-within")
+
+    def column(self, name: str) -> np.ndarray:
+        """Return one column of all rows."""
+        parts = [self.select(index, [name])[name].to_numpy() for index in range(len(self.units))]
+        return np.concatenate(parts) if parts else self.empty()[name].to_numpy()
 
     def all_rows(self) -> pd.DataFrame:
         """Return the whole table in memory."""
@@ -206,7 +258,7 @@ class TableProduct:
 
     def _path(self, index: int, store: Store):
         if self.pixels is None:
-            return store.table(self.stage, self.units[index].name)
+            return store.table(self.stage, self.names[index])
         return store.partition(self.stage, self.order or 0, self.pixels[index])
 
 
@@ -215,7 +267,29 @@ class _LoadPartition:
     product: TableProduct
 
     def __call__(self, index: int) -> pd.DataFrame:
-        return self.product.load(index)
+        return _with_lists(self.product.load(index), self.product.schema)
+
+
+def _with_lists(frame: pd.DataFrame, schema: pa.Schema) -> pd.DataFrame:
+    """Return a frame whose lists have an Arrow type: dask makes texts of objects."""
+    lists = {
+        field.name: pd.arrays.ArrowExtensionArray(pa.array(list(frame[field.name]), type=field.type))
+        for field in schema
+        if pa.types.is_list(field.type)
+    }
+    return frame.assign(**lists) if lists else frame
+
+
+@dataclass(frozen=True)
+class _LoadWithin:
+    product: TableProduct
+    region: Region | Cone
+    ra: str
+    dec: str
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        frame = _with_lists(self.product.load(index), self.product.schema)
+        return frame[self.region.contains(frame[self.ra], frame[self.dec])]
 
 
 def to_frame(table: pa.Table) -> pd.DataFrame:

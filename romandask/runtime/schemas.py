@@ -24,15 +24,20 @@ TYPES = {
 
 @lru_cache(maxsize=32)
 def schema(name: str, bands: tuple[str, ...] = ()) -> pa.Schema:
-    """Return the schema of a product; columns named with {band} are repeated for every band."""
+    """Return the schema of a product; columns with {band} are repeated for every band, with {rubin} for LSST's."""
     content = read_yaml(resource_folder("catalogs") / f"{name}.yaml")
     fields = []
     for column in content["columns"]:
-        for band in bands if "{band}" in column["name"] else ("",):
-            metadata = {
-                "unit": column.get("unit") or "",
-                "ucd": column.get("ucd") or "",
-                "description": column["description"].replace("{band}", band),
-            }
-            fields.append(pa.field(column["name"].replace("{band}", band), TYPES[column["dtype"]], metadata=metadata))
+        for mark, values in (("{band}", bands), ("{rubin}", tuple("ugrizy")), ("", ("",))):
+            if mark in column["name"]:
+                fields += [_field(column, mark, value) for value in values]
+                break
     return pa.schema(fields, metadata={"description": content["description"]})
+
+
+def _field(column: dict, mark: str, value: str) -> pa.Field:
+    name, description = column["name"], column["description"]
+    if mark:
+        name, description = name.replace(mark, value), description.replace(mark, value)
+    metadata = {"unit": column.get("unit") or "", "ucd": column.get("ucd") or "", "description": description}
+    return pa.field(name, TYPES[column["dtype"]], metadata=metadata)

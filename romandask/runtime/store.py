@@ -11,11 +11,18 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from romandask.model.errors import UserError
+
+CELL = "_healpix_29"
+"""Column of HEALPix cells of order 29, by which the rows of catalogs are sorted."""
+ROWS_A_GROUP = 50_000
+MARGIN = "_margin"
+"""Ending of the names of stages that make a catalog's margin."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +55,18 @@ class Store:
         """The folder of the report."""
         return self.root / "report"
 
+    def collection(self, name: str) -> Path:
+        """Folder of a HATS collection, for example truth/galaxies: a catalog and its margin."""
+        return self.root / name.removesuffix(MARGIN)
+
     def catalog(self, name: str) -> Path:
-        """Folder of a HATS catalog, for example truth/galaxies."""
-        return self.root / name
+        """Folder of a HATS catalog, or of a margin: for example truth/galaxies, truth/galaxies_margin."""
+        return self.collection(name) / ("margin" if name.endswith(MARGIN) else "catalog")
 
     def partition(self, name: str, order: int, pixel: int) -> Path:
         """File of one partition of a HATS catalog."""
         folder = pixel // 10_000 * 10_000
-        return self.root / name / "dataset" / f"Norder={order}" / f"Dir={folder}" / f"Npix={pixel}.parquet"
+        return self.catalog(name) / "dataset" / f"Norder={order}" / f"Dir={folder}" / f"Npix={pixel}.parquet"
 
     def table(self, name: str, unit: str | None = None) -> Path:
         """File of a table that is not partitioned by the sky, whole or one unit of it."""
@@ -105,15 +116,26 @@ def write_json(path: Path, content: Any) -> None:
 def write_parquet(path: Path, table: pa.Table) -> bytes:
     """Write a Parquet file whole, with page checksums, and return the bytes that were written."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True, row_group_size=ROWS_A_GROUP)
     content = sink.getvalue().to_pybytes()
     write_bytes(path, content)
     return content
 
 
-def read_parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read a Parquet file, page checksums verified."""
-    return pq.ParquetFile(path, page_checksum_verification=True).read(columns=columns)
+def read_parquet(path: Path, columns: list[str] | None = None, between: tuple[int, int] | None = None) -> pa.Table:
+    """Read a Parquet file, page checksums verified; of rows those with low <= _healpix_29 < high if asked."""
+    file = pq.ParquetFile(path, page_checksum_verification=True)
+    if between is None:
+        return file.read(columns=columns)
+    low, high = between
+    place = file.schema_arrow.names.index(CELL)
+    ranges = [file.metadata.row_group(k).column(place).statistics for k in range(file.metadata.num_row_groups)]
+    groups = [k for k, found in enumerate(ranges) if found is None or (found.max >= low and found.min < high)]
+    wanted = None if columns is None else list(dict.fromkeys([*columns, CELL]))
+    table = file.read_row_groups(groups, columns=wanted)
+    cells = table.column(CELL)
+    table = table.filter(pc.and_(pc.greater_equal(cells, low), pc.less(cells, high)))
+    return table if columns is None else table.select(columns)
 
 
 def open_images(

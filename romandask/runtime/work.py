@@ -30,7 +30,7 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store) ->
         made = product.write(task.index, store)
     record = Record(
         stage=product.stage,
-        unit=product.units[task.index].name,
+        unit=product.names[task.index],
         inputs=task.inputs,
         output=made.output,
         bytes=made.bytes,

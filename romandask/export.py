@@ -1,0 +1,67 @@
+"""Export: what a survey holds, in the files that others read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+
+from romandask.formats import obseq, truth_files
+from romandask.model.errors import UserError
+from romandask.runtime.products import TableProduct
+from romandask.survey import Survey
+
+
+def export_truth(survey: Survey, folder: Path) -> list[Path]:
+    """Write galaxies.fits, stars.fits and seds.hdf5 of a stored survey and return where they are.
+
+    Raises
+    ------
+    UserError
+        If the truth is not all there, or the folder cannot be written.
+    """
+    catalogs = survey.truth_catalogs
+    for product in (catalogs.galaxies, catalogs.stars):
+        missing = [name for k, name in enumerate(product.names) if not product.has(k)]
+        if missing:
+            raise UserError(
+                f"{product.stage} is not all there: {len(missing)} of {len(product.names)} units are missing, first "
+                f"{missing[0]}; run the survey first"
+            )
+    _prepare(folder)
+    bins = max(len(catalogs.edges) - 1, 0)
+    written = []
+    for product in (catalogs.galaxies, catalogs.stars):
+        path = folder / f"{product.stage.split('/')[1]}.fits"
+        truth_files.write_fits(path, product.schema, _parts(product), len(product.column("ra")), bins)
+        written.append(path)
+    path = folder / "seds.hdf5"
+    truth_files.write_spectra(path, catalogs.library, catalogs.edges)
+    return [*written, path]
+
+
+def export_obseq(survey: Survey, path: Path) -> int:
+    """Write all Roman visits as an observing sequence and return their number.
+
+    Raises
+    ------
+    UserError
+        If the survey has no Roman, or the file cannot be written.
+    """
+    visits = survey.visits("roman")
+    _prepare(path.parent)
+    obseq.write(path, visits)
+    return len(visits)
+
+
+def _parts(product: TableProduct) -> Iterator[pd.DataFrame]:
+    for index in range(len(product.names)):
+        yield product.load(index)
+
+
+def _prepare(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror})") from None

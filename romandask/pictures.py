@@ -10,6 +10,8 @@ from astropy.visualization import make_lupton_rgb
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from romandask.model.sky import Region, covering_sums
+
 ROMAN_RGB = ("F184", "H158", "J129", "Y106")
 RUBIN_RGB = ("z", "i", "r", "g")
 LARGEST = 1600
@@ -64,6 +66,71 @@ def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
             axes.set_title(f"{survey} {band} {name}", fontsize=10)
             axes.set_axis_off()
             figure.colorbar(shown, ax=axes, fraction=0.046)
+    return _png(figure)
+
+
+def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float, bands: tuple[str, ...]) -> bytes:
+    """Return the distributions of the true objects by component, as in Troxel et al. 2023, figure 2.
+
+    `area` is in square arcminutes; `bands` are up to four whose counts and colour are shown.
+    """
+    figure = _figure(15.0, 7.6)
+    axes = figure.subplots(2, 4).ravel()
+    edges = np.arange(14, 32.1, 0.5)
+    for band in bands[:4]:
+        for frame, line in ((galaxies, "-"), (stars, ":")):
+            counts, _ = np.histogram(ab_magnitude(frame[f"flux_{band}"]), edges)
+            axes[0].stairs(counts / area / 0.5, edges, linestyle=line, label=band if line == "-" else None)
+    axes[0].set(yscale="log", xlabel="AB mag", ylabel="a mag and arcmin$^2$", title="Counts (dotted: stars)")
+    axes[0].legend(fontsize=8)
+    axes[1].hist(galaxies["redshift"], np.arange(0, 3.2, 0.1), histtype="step")
+    axes[1].set(xlabel="redshift", title="Galaxies")
+    lit = {name: np.isfinite(galaxies[f"{name}_magnorm"]) for name in ("bulge", "disk", "knots")}
+    for name, rows in lit.items():
+        axes[2].hist(galaxies.loc[rows, f"{name}_magnorm"], np.arange(14, 40, 0.5), histtype="step", label=name)
+        if name == "knots":
+            continue
+        major, minor = (galaxies.loc[rows, f"size_{axis}{name}_true"] for axis in ("", "minor_"))
+        axes[3].hist(np.sqrt(major * minor), np.geomspace(0.01, 10, 50), histtype="step", label=name)
+        axes[4].hist((major - minor) / (major + minor), np.arange(0, 1, 0.03), histtype="step", label=name)
+    axes[2].set(yscale="log", xlabel="magnorm", title="Brightness by component")
+    axes[3].set(xscale="log", xlabel="half-light radius, arcsec", title="Sizes")
+    axes[4].set(xlabel="(a - b) / (a + b)", title="Shapes before lensing")
+    for each in axes[2:5]:
+        each.legend(fontsize=8)
+    first, last = bands[0], bands[-1]
+    for frame, name in ((galaxies, "galaxies"), (stars, "stars")):
+        colour = ab_magnitude(frame[f"flux_{first}"]) - ab_magnitude(frame[f"flux_{last}"])
+        axes[5].hist(colour, np.arange(-2, 6, 0.15), histtype="step", density=True, label=name)
+    axes[5].set(xlabel=f"{first} - {last}", title="Colours")
+    axes[5].legend(fontsize=8)
+    axes[6].hist(galaxies["convergence"], 60, histtype="step", label="$\\kappa$")
+    axes[6].hist(np.hypot(galaxies["shear_1"], galaxies["shear_2"]), 60, histtype="step", label="$|\\gamma|$")
+    axes[6].set(yscale="log", title="Lensing")
+    axes[6].legend(fontsize=8)
+    some = galaxies["n_knots"] > 0
+    axes[7].hist(galaxies.loc[some, "n_knots"], np.arange(0, 33, 1), histtype="step")
+    axes[7].set(xlabel="knots", title=f"Knots: {some.mean():.1%} of galaxies have them")
+    return _png(figure)
+
+
+def exposure_maps(region: Region, footprints: dict[str, np.ndarray]) -> bytes:
+    """Return how many exposures (by band: corners (n, 4, 2), degrees) points of a region have: map and histogram."""
+    figure = _figure(3.6 * len(footprints), 6.2)
+    axes = figure.subplots(2, len(footprints), squeeze=False)
+    ra = region.ra_min + region.width * (np.arange(150) + 0.5) / 150
+    dec = region.dec_min + (region.dec_max - region.dec_min) * (np.arange(150) + 0.5) / 150
+    weight = np.cos(np.radians(dec))[:, None] * np.ones(len(ra))
+    for column, (band, corners) in enumerate(footprints.items()):
+        counts = covering_sums(corners, ra[None, :], dec[:, None])
+        extent = (region.ra_min, region.ra_min + region.width, region.dec_min, region.dec_max)
+        image = axes[0, column].imshow(counts, origin="lower", extent=extent, aspect="auto", interpolation="nearest")
+        axes[0, column].set(title=f"{band}: mean {np.average(counts, weights=weight):.1f}", xlabel="RA, degrees")
+        axes[0, column].invert_xaxis()
+        figure.colorbar(image, ax=axes[0, column])
+        bins = np.arange(counts.max() + 2) - 0.5
+        axes[1, column].hist(counts.ravel(), bins, weights=weight.ravel() / weight.sum())
+        axes[1, column].set(xlabel="exposures", ylabel="share of the area" if column == 0 else "")
     return _png(figure)
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from romandask import pictures
 from romandask.flow import Planned, run_figures, stored_versions
+from romandask.pointings import corners_of
 from romandask.survey import Survey
 
 STYLE = """
@@ -29,6 +30,7 @@ def write_report(survey: Survey) -> Path:
     busiest = _busiest_tile(survey, objects)
     sections = [
         _overview(survey, objects),
+        _inputs(survey),
         _sky(survey, objects, busiest),
         _measurements(survey, objects),
         _blends(survey),
@@ -113,6 +115,24 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         )
         + _image(pictures.maps(layers), "Weight and number of exposures of the tile.")
     )
+
+
+def _inputs(survey: Survey) -> str:
+    catalogs = survey.truth_catalogs
+    frames = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
+    galaxies, stars = (frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in frames)
+    bands = tuple(survey.bandpasses)
+    # blue and red of each survey
+    shown = tuple(dict.fromkeys(band for band in ("r", "i", "H158", bands[0], bands[-1]) if band in bands))[:4]
+    text = "<h2>The true universe and where it is looked at</h2>" + _image(
+        pictures.input_distributions(galaxies, stars, survey.region.area, shown),
+        f"{len(galaxies)} galaxies and {len(stars)} stars of the region, by component.",
+    )
+    for name, instrument in survey.instruments.items():
+        table = survey.pointings(name)
+        footprints = {band: corners_of(table[table["band"] == band]) for band in instrument.bands}
+        text += _image(pictures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
+    return text
 
 
 def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:

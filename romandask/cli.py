@@ -17,7 +17,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
 from romandask.export import export_obseq, export_truth  # noqa: E402
@@ -68,7 +68,7 @@ def plan(
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
     rows = flow.plan(Survey(settings))
-    table = Table("stage", "units", "image bytes", "core hours", "peak memory a worker")
+    table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
         hours = f"{row.hours:.2f}" if row.hours else "-"

@@ -28,7 +28,7 @@ WIDE = 1e7
 """Square arcminutes above which the cells of a region are not listed one by one."""
 NEAR_ORDER = 11
 """HEALPix order of the cells, 1.7 arcmin wide, that decide which rows are near."""
-BYTES_A_ROW = 2200
+BYTES_A_ROW = 2800
 """Peak memory of a galaxy while a partition is made: its row, its random numbers and its photons."""
 SOURCE_DENSITY = 600.0
 """Galaxies a square arcminute that partitions of source catalogs are sized for."""
@@ -204,7 +204,7 @@ def _tables(
     def table(kind: str, make: Callable[[int], pd.DataFrame], state: Any, inputs: tuple) -> TableProduct:
         units = tuple(Unit(f"{settings.order}-{cell}", {**state, "cell": int(cell)}, inputs) for cell in cells)
         pixels = tuple(map(int, cells))
-        seconds = cell_area(settings.order) * density * 2e-5
+        seconds = cell_area(settings.order) * density * 1.1e-5
         return TableProduct(
             f"truth/{kind}", units, make, schema(kind, bands), pixels, settings.order, per_cell, seconds
         )

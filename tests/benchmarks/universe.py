@@ -60,7 +60,7 @@ def compare(frame: pd.DataFrame, region: Region, nside: int) -> None:
         sigma8=cosmology.sigma_8, transfer_function="eisenstein_hu", matter_power_spectrum="halofit",
     )  # fmt: skip
     i = 31.4 - 2.5 * np.log10(frame["flux_i"])
-    chosen = frame[(i < 25.3)].sample(frac=0.5, random_state=1)
+    chosen = frame[(i < 25.3)].sample(frac=0.25, random_state=1)
     density, edges = np.histogram(chosen["redshift"], np.linspace(0, 3, 61))
     middle = (edges[1:] + edges[:-1]) / 2
     ell = np.unique(np.geomspace(2, 2 * nside, 200).astype(int))
@@ -92,7 +92,7 @@ def compare(frame: pd.DataFrame, region: Region, nside: int) -> None:
         tracer = tracers[kind]
         sparse = pyccl.angular_cl(theory, tracer, tracer, ell)
         cl = np.exp(np.interp(np.log(dense), np.log(ell), np.log(sparse))) * window**power
-        return pyccl.correlation(theory, ell=dense, C_ell=cl, theta=theta, type=function, method="Legendre")
+        return pyccl.correlation(theory, ell=dense, C_ell=cl, theta=theta, type=function, method="Bessel")
 
     w, plus = expected("w", "NN", 4), expected("xi", "GG+", 4)
     print("arcmin      w   theory  ratio |      xi+   theory  ratio")

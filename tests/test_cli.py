@@ -87,3 +87,18 @@ def test_ingest_accounts_for_every_row(shared, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "rows in 4987 = rows out" in done.stdout
     assert (tmp_path / "s" / "truth" / "galaxies" / "collection.properties").is_file()
+
+
+def test_the_papers_survey_is_planned_whole(tmp_path):
+    """29,153 SCA images, 1039 tiles and 15.3 square degrees in the paper; nothing is made."""
+    done = command("plan", "troxel2023", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = [line.replace("│", " ").split() for line in done.stdout.splitlines() if "/" in line]
+    units = {row[0]: int(row[1]) for row in rows}
+    assert units["exposures/roman"] == pytest.approx(29153, rel=0.06)
+    assert units["detections/roman"] == pytest.approx(1039, rel=0.02)
+    assert units["coadds/rubin"] == 6 * units["detections/rubin"]
+    assert list(tmp_path.iterdir()) == []
+    done = command("plan", "troxel2023", "run.memory_limit=2", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "lower coadds.pixels, or raise run.memory_limit" in done.stderr

@@ -1,19 +1,22 @@
 """What is written is read back, whole, and damage is found."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import zarr
 
 from romandask.model.errors import UserError
 from romandask.runtime.lock import locked
 from romandask.runtime.manifest import Record, digest, read_record, write_record
-from romandask.runtime.products import ImageProduct, TableProduct, Unit, conform
+from romandask.runtime.products import ImageProduct, TableProduct, conform
 from romandask.runtime.store import Store, Variable, read_parquet, write_bytes, write_parquet
+from romandask.runtime.units import LazyUnits, Unit, names_of
 
 PLANE = Variable("image", "float32", (64, 48), ("y", "x"), {"units": "nJy"})
 
@@ -147,3 +150,33 @@ def test_a_store_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
         Store(Path(tmp_path / "file" / "store")).prepare()
+
+
+def test_lazy_units_are_worked_out_when_asked_for_and_travel_as_names():
+    asked = []
+
+    def make(index):
+        asked.append(index)
+        return Unit(f"u{index}", {"index": index})
+
+    units = LazyUnits(("u0", "u1", "u2"), make)
+    assert names_of(units) == ("u0", "u1", "u2")
+    assert asked == []
+    assert units[-1].settings == {"index": 2}
+    assert [unit.name for unit in units[:2]] == ["u0", "u1"]
+    assert asked == [2, 0, 1]
+    there = pickle.loads(pickle.dumps(units))
+    assert names_of(there) == names_of(units)
+    with pytest.raises(RuntimeError, match="worked out where"):
+        there[0]
+
+
+def test_rows_between_cells_are_read_from_the_file_alone_that_may_hold_them(tmp_path):
+    path = tmp_path / "t.parquet"
+    cells = np.arange(0, 4_000_000, 20)
+    write_parquet(path, pa.table({"_healpix_29": cells, "x": cells * 2.0, "y": cells * 0.0}))
+    assert pq.ParquetFile(path).metadata.num_row_groups == 4
+    found = read_parquet(path, ["x"], (1_000_010, 1_000_100))
+    assert found.column_names == ["x"]
+    np.testing.assert_array_equal(found["x"].to_numpy() / 2, [1_000_020, 1_000_040, 1_000_060, 1_000_080])
+    assert read_parquet(path, None, (9_000_000, 9_000_001)).num_rows == 0

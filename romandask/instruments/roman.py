@@ -11,6 +11,7 @@ import galsim
 import galsim.roman
 import numpy as np
 import pandas as pd
+from galsim.roman import roman_psfs
 from pydantic import Field, NonNegativeInt, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
@@ -128,6 +129,10 @@ class Roman:
 
 def _date(mjd: float):
     return datetime(1858, 11, 17) + timedelta(days=mjd)
+
+
+# GalSim keeps the pupils of ten SCAs, half a gigabyte; a worker draws one SCA at a time
+roman_psfs._make_aperture.resize(1)
 
 
 @lru_cache(maxsize=1)

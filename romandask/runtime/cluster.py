@@ -166,9 +166,13 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
     quiet = {
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.target": False,
+        # a worker that pauses for its heap, with nothing to do, never comes back; one task runs at a time anyway
+        "distributed.worker.memory.pause": False,
         "distributed.admin.large-graph-warning-threshold": "100MB",
         # the threads that decode chunks would each keep a heap of their own, and a worker twice what it uses
         "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2,
+        # arrays above a megabyte go back to the system at once, not to a heap that grows from unit to unit
+        "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 20,
     }
     with (
         dask.config.set(quiet),

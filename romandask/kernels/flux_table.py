@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from romandask.kernels.photometry import SEEN, Dust, band_photons
+from romandask.kernels.photometry import SEEN, Dust, after, band_photons
 from romandask.model.spectra import LOG_STEP, Bandpass, LibrarySpectra, SpectrumLibrary
 
 RV = 3.1
@@ -114,20 +114,6 @@ def _lagrange(at, nodes, out):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _undimmed(logarithm):
-    """Return exp(-logarithm) for what dust takes, by a series of a 64th of it squared six times: it is vectorised."""
-    x = -logarithm / 64
-    e = 1 + x * (1 + x * (0.5 + x * (1 / 6 + x * (1 / 24 + x / 120))))
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    return e
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _interpolate(table, rows, magnorm, sed, position, own_av, mw_av, own_nodes, coarse_nodes, mw_nodes, out):
     bands = table.shape[3]
     n, m, k = own_nodes.shape[1], coarse_nodes.shape[1], mw_nodes.shape[1] - 1
@@ -160,5 +146,5 @@ def _interpolate(table, rows, magnorm, sed, position, own_av, mw_av, own_nodes, 
         for b in range(bands):
             out[0, i, b] = np.exp(own[b] + added[b] - dim)
         for b in range(bands):
-            out[1, i, b] = out[0, i, b] * _undimmed(added[b])
-            out[2, i, b] = out[0, i, b] * _undimmed(own[b] + added[b] - clear[b])
+            out[1, i, b] = out[0, i, b] * after(added[b])
+            out[2, i, b] = out[0, i, b] * after(own[b] + added[b] - clear[b])

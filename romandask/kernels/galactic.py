@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import astropy.units as u
-import cdshealpix.nested as healpix
 import numpy as np
 import pandas as pd
 from astropy.coordinates import SkyCoord
 
-from romandask.kernels.galaxies import CELL_ORDER
+from romandask.kernels.galaxies import CELL_ORDER, positions
 from romandask.kernels.photometry import SEEN, Dust, LibrarySpectra, band_photons, njy, no_dust
 from romandask.kernels.universe import REFERENCE, flux_columns
 from romandask.model.seeds import rng
@@ -111,7 +110,7 @@ def star_rows(
         index.append(np.arange(n))
     uniform = np.concatenate(drawn) if drawn else np.empty((0, 4))
     cell = np.concatenate(cell_of_star).astype(np.int64) if drawn else np.empty(0, np.int64)
-    ra, dec = _positions(cell, uniform[:, 0])
+    ra, dec = positions(cell, uniform[:, 0])
     magnitude, absolute = _brightness(line, uniform[:, 1], uniform[:, 2])
     heat = np.interp(absolute, *TEMPERATURE.T)
     sed = spectra.start + np.abs(np.log(temperatures)[None] - np.log(heat)[:, None]).argmin(axis=1)
@@ -130,15 +129,6 @@ def star_rows(
         k = names.index(band)
         frame |= flux_columns(band, njy(unit[:, :, k] * 10 ** (-0.4 * magnorm), bandpasses[k]))
     return pd.DataFrame(frame)
-
-
-def _positions(cells: np.ndarray, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if not len(cells):
-        return np.empty(0), np.empty(0)
-    depth = 2 * (29 - CELL_ORDER)
-    inside = (cells << depth) + (uniform * (1 << depth)).astype(np.int64)
-    lon, lat = healpix.healpix_to_lonlat(inside.astype(np.uint64), 29)
-    return lon.to_value(u.deg), lat.to_value(u.deg)
 
 
 def _brightness(line: Sightline, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

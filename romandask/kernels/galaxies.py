@@ -100,7 +100,7 @@ def _hosts(
     in_cell = np.repeat(np.arange(len(cells)), each)
     shell = np.concatenate([np.repeat(np.arange(numbers.shape[1]), number) for number in numbers] or [np.empty(0, int)])
     index = np.arange(len(uniform)) - np.repeat(np.cumsum(each) - each, each)
-    ra, dec = _positions(cells[in_cell], uniform[:, POSITION])
+    ra, dec = positions(cells[in_cell], uniform[:, POSITION])
     magnitude = people.host_magnitude(uniform[:, MAGNITUDE], shell)
     redshift = counts.redshift_within(uniform[:, REDSHIFT], shell, magnitude)
     return Galaxies((cells[in_cell] << 24) + index, ra, dec, redshift, magnitude, uniform), in_cell
@@ -128,7 +128,7 @@ def _satellites(hosts: Galaxies, members: np.ndarray, in_cell: np.ndarray, cells
     return Galaxies((cells[in_cell[host]] << 24) + index, ra, dec, redshift, magnitude, uniform)
 
 
-def _positions(cells: np.ndarray, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def positions(cells: np.ndarray, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Uniform in the cells: random cells of order 29 (0.4 mas) inside them, for HEALPix cells have equal areas."""
     if not len(cells):
         return np.empty(0), np.empty(0)

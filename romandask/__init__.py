@@ -10,10 +10,12 @@ from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.pipeline import Pipeline, load_pipeline
 from romandask.pointings import pointings
+from romandask.psfs import psfs
 from romandask.statistics import statistics
 from romandask.survey import Survey
 from romandask.survey import open_survey as open  # noqa: A004
 from romandask.truth import truth
+from romandask.truth_index import truth_index
 
 __version__ = _version("romandask")
 __all__ = [
@@ -30,6 +32,8 @@ __all__ = [
     "objects",
     "open",
     "pointings",
+    "psfs",
     "statistics",
     "truth",
+    "truth_index",
 ]

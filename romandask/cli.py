@@ -20,7 +20,7 @@ from rich.console import Console  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
-from romandask.export import export_obseq, export_truth  # noqa: E402
+from romandask.export import export_obseq, export_psf, export_truth  # noqa: E402
 from romandask.model.config import read_yaml  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline, pipeline_of  # noqa: E402
@@ -226,6 +226,17 @@ def export_visits(
     """Write all Roman visits of a pipeline as an observing sequence (FITS) that GalSim-based tools read."""
     count = export_obseq(Survey(load_pipeline(pipeline, overrides)), out)
     Console().print(f"wrote {count} visits to {out}", highlight=False, soft_wrap=True)
+
+
+@export_app.command("psf")
+def export_psf_images(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    exposure: Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")],
+) -> None:
+    """Write PSF images of Roman exposures (FITS): a unit star, 8 samples a pixel."""
+    for path in export_psf(open_survey(store), out, exposure):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
 @contextmanager

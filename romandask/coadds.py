@@ -14,20 +14,22 @@ import pandas as pd
 import sep
 from astropy.wcs import WCS
 
-from romandask.exposures import RenderExposure, cone, header_text, scene_stamp
+from romandask.exposures import RenderExposure, cone, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.detector import NO_DATA, SATURATED, noise_realisation
 from romandask.kernels.drizzle import Strip, Sums, pixel_map, strips
-from romandask.kernels.psf import PsfBasis
-from romandask.kernels.render import POINT, Scene, draw
+from romandask.kernels.fourier import POINT
+from romandask.kernels.psf import PsfModel
+from romandask.kernels.render import Scene, draw, draw_wide, plan_stamps
 from romandask.kernels.scene import build_scene
 from romandask.kernels.stack import stack
 from romandask.model.config import CoaddSettings, RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import touching_pairs
-from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, ab_photon_density
+from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
 from romandask.model.tiles import Tile, tangent_header
 from romandask.pointings import corners_of
+from romandask.psfs import flat_shares
 from romandask.runtime.manifest import digest
 from romandask.runtime.products import Coordinates, ImageProduct
 from romandask.runtime.store import Variable
@@ -200,13 +202,13 @@ class DrawTile:
                 "nimages": layers.count,
                 "psf": np.zeros((side, side)),
             }
-        ra, dec, radius = cone(tile.corners(self.settings.grid().side))
-        scene = build_scene(source.truth.near(ra, dec, radius), wcs, bandpass, to_njy, instrument.knot_smoothing)
+        truth = source.truth.near(*cone(tile.corners(self.settings.grid().side)))
+        scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
-        size = max(64, scene_stamp(scene, faintest, self.render.largest))
-        basis = instrument.effective_psf(chosen, layers.shares, size)
+        psf = instrument.effective_psf(chosen, layers.shares)
+        stamps = plan_stamps(scene, psf.edges, shape, faintest, self.render.largest)
         covered = layers.weight > 0
-        expected = np.where(covered, draw(scene, basis, shape, faintest), 0)
+        expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
         empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
         light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
         other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band).standard_normal(
@@ -217,7 +219,7 @@ class DrawTile:
             "weight": layers.weight,
             "noise": other * np.sqrt(empty),
             "nimages": layers.count,
-            "psf": _star(basis, bandpass, psf_side(instrument)),
+            "psf": _star(psf, bandpass, psf_side(instrument)),
         }
 
 
@@ -255,9 +257,13 @@ def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return light
 
 
-def _star(basis: PsfBasis, bandpass: Bandpass, side: int, offset: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def _star(
+    psf: PsfModel,
+    bandpass: Bandpass,
+    side: int,
+    offset: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
     """Return a unit star (side, side) of flat f_nu whose centre is `offset` pixels from the middle."""
-    photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
     middle = (side - 1) / 2
     scene = Scene(
         x=np.array([middle + offset[0]]),
@@ -268,10 +274,11 @@ def _star(basis: PsfBasis, bandpass: Bandpass, side: int, offset: tuple[float, f
         matrix=np.zeros((1, 2, 2)),
         smoothing=np.zeros((1, 2, 2)),
         knots=np.zeros(1, int),
-        photons=(photons / photons.sum())[None],
+        photons=flat_shares(bandpass)[None],
     )
-    # a star is drawn on the largest stamp that the basis offers
-    return draw(scene, basis, (side, side), 0.0)
+    image = np.zeros((side, side), np.float32)
+    draw_wide(image, scene, scene.photons, psf.nodes, psf.grid, np.array([psf.grid.size]))
+    return image
 
 
 def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, tile: Tile, side: int) -> None:
@@ -282,10 +289,10 @@ def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, t
     half = int(np.ceil(1.5 * side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 2
     column, row = np.rint(np.clip(at, half + 1, [nx - half - 2, ny - half - 2])).astype(int)
     rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-    basis, bandpass = instrument.psf(exposure, 256), instrument.bandpass(exposure.band)
+    model, bandpass = instrument.psf_at(exposure, column, row), instrument.bandpass(exposure.band)
     area = pixel_areas_at(wcs, float(column), float(row))
     for offset in PSF_PHASES:
-        star = _star(basis, bandpass, 2 * half + 1, offset)
+        star = _star(model, bandpass, 2 * half + 1, offset)
         ra, dec = wcs.all_pix2world(column + offset[0], row + offset[1], 0)
         target = WCS(tangent_header(float(ra), float(dec), side, instrument.coadd_scale))
         weight = np.full(star.shape, exposure.exptime, np.float32)

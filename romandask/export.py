@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
 
-from romandask.formats import obseq, truth_files
+from romandask.formats import obseq, psf_image, truth_files
 from romandask.model.errors import UserError
 from romandask.runtime.products import TableProduct
 from romandask.survey import Survey
@@ -53,6 +54,33 @@ def export_obseq(survey: Survey, path: Path) -> int:
     _prepare(path.parent)
     obseq.write(path, visits)
     return len(visits)
+
+
+def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
+    """Write the PSF images of some Roman exposures, one FITS file each, and return where they are.
+
+    Raises
+    ------
+    UserError
+        If the survey has no such exposure, or the folder cannot be written.
+    """
+    product = survey.psf_product("roman")
+    places = {name: index for index, name in enumerate(product.names)}
+    for name in names:
+        if name not in places:
+            close = difflib.get_close_matches(name, places, n=1, cutoff=0.0)
+            raise UserError(f"exposure {name!r}: this survey has {len(places)}, nearest {', '.join(close) or 'none'}")
+    _prepare(folder)
+    attributes = product.variables[0].attributes
+    table = survey.pointings("roman")
+    written = []
+    for name in names:
+        path = folder / f"psf-{name}.fits"
+        image = product.load(places[name])["psf"]
+        row = table.iloc[places[name]].to_dict()
+        psf_image.write(path, image, attributes["oversampling"], attributes["pixel_scale"], row)
+        written.append(path)
+    return written
 
 
 def _parts(product: TableProduct) -> Iterator[pd.DataFrame]:

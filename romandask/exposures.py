@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import galsim
 import numpy as np
 import pandas as pd
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from romandask.instruments.exposure import Instrument, exposure_of, exposures_of
+from romandask.instruments.exposure import Exposure, Instrument, exposure_of, exposures_of
 from romandask.kernels.detector import DQ_FLAGS, observe
-from romandask.kernels.render import Scene, component_reach, draw, largest_stamp
-from romandask.kernels.scene import build_scene
+from romandask.kernels.galsim_engine import draw_objects
+from romandask.kernels.render import Stamps, draw, plan_stamps
+from romandask.kernels.scene import Drawable, Truth, build_scene
 from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
@@ -24,6 +27,24 @@ from romandask.truth import TruthCatalogs
 
 REACH = 30.0
 """Objects this far outside a detector, arcsec, may shine on it."""
+STAR_REACH = 115.0
+"""So may bright stars, for their diffraction spikes are long."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What an exposure looks at, ready to be drawn."""
+
+    exposure: Exposure
+    header: dict
+    truth: Truth
+    drawable: Drawable
+    background: np.ndarray
+    """(ny, nx) expected electrons that do not come from objects."""
+    faintest: float
+    """Surface brightness, electrons a pixel, below which stamps may end."""
+    stamps: Stamps
+    """Of the drawable objects."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +57,65 @@ class RenderExposure:
     render: RenderSettings
     seed: int
 
+    def view(self, index: int) -> View:
+        """Return what the exposure at a row of the pointings table looks at."""
+        exposure, instrument = exposure_of(self.table.iloc[index]), self.instrument
+        header = instrument.header(exposure)
+        truth = self.truth.near(*cone(corners_of(self.table.iloc[[index]])[0]))
+        drawable = build_scene(
+            truth, WCS(header), instrument.bandpass(exposure.band), exposure.exptime, instrument.knot_smoothing,
+            (instrument.shape, STAR_REACH / instrument.pixel_scale),
+        )  # fmt: skip
+        background = instrument.background(exposure, header)
+        faintest = self.render.truncation * instrument.sky_noise(exposure, background)
+        stamps = plan_stamps(
+            drawable.scene, instrument.psf_edges(exposure), instrument.shape, faintest, self.render.largest,
+            instrument.bright_psfs(exposure),
+        )  # fmt: skip
+        return View(exposure, header, truth, drawable, background, faintest, stamps)
+
+    def expected(self, view: View) -> np.ndarray:
+        """Return the noiseless image (ny, nx), electrons, of the objects."""
+        instrument, exposure = self.instrument, view.exposure
+        if self.render.engine == "galsim":
+            scale = instrument.pixel_scale
+            profiles = Profiles(instrument, exposure)
+            return draw_objects(view.drawable.scene, profiles, instrument.shape, view.stamps, scale)
+        psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
+        return draw(view.drawable.scene, psf, instrument.shape, view.stamps, view.faintest, bright)
+
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return image, truth and dq of the exposure at a row of the pointings table."""
-        exposure = exposure_of(self.table.iloc[index])
-        header = self.instrument.header(exposure)
-        ra, dec, radius = cone(corners_of(self.table.iloc[[index]])[0])
-        truth = self.truth.near(ra, dec, radius)
-        bandpass = self.instrument.bandpass(exposure.band)
-        scene = build_scene(truth, WCS(header), bandpass, exposure.exptime, self.instrument.knot_smoothing)
-        background = self.instrument.background(exposure, header)
-        faintest = self.render.truncation * self.instrument.sky_noise(exposure, background)
-        basis = self.instrument.psf(exposure, scene_stamp(scene, faintest, self.render.largest))
-        expected = draw(scene, basis, self.instrument.shape, faintest)
-        random = rng(self.seed, "exposures", self.instrument.name, exposure.visit, exposure.detector)
-        image, dq = observe(expected, background, self.instrument.detector, random)
+        view = self.view(index)
+        expected = self.expected(view)
+        random = rng(self.seed, "exposures", self.instrument.name, view.exposure.visit, view.exposure.detector)
+        image, dq = observe(expected, view.background, self.instrument.detector, random)
         return {"image": image, "truth": expected, "dq": dq}
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """GalSim's PSFs of an exposure, one a node, on a coarse grid of places: what the second engine draws with."""
+
+    instrument: Instrument
+    exposure: Exposure
+    cells: int = 4
+    """Along each side of the detector; an object has the PSF of the middle of its cell."""
+
+    def __call__(self, x: float, y: float) -> tuple[tuple[int, int], list[galsim.GSObject]]:
+        """Return the cell of a position and the PSFs there."""
+        i, j = (
+            int(np.clip(value * self.cells // side, 0, self.cells - 1))
+            for value, side in zip((x, y), self.instrument.shape[::-1], strict=True)
+        )
+        return (i, j), _cell_profiles(self, i, j)
+
+
+@lru_cache(maxsize=2)
+def _cell_profiles(profiles: Profiles, i: int, j: int) -> list[galsim.GSObject]:
+    ny, nx = profiles.instrument.shape
+    x, y = (i + 0.5) * nx / profiles.cells - 0.5, (j + 0.5) * ny / profiles.cells - 0.5
+    return profiles.instrument.profiles(profiles.exposure, x, y)
 
 
 def exposures(
@@ -107,26 +172,21 @@ def exposures(
         coordinates,
         {"survey": instrument.name},
         # image, truth, dq, background and working copies; two PSF bases, the last and the new; the objects
-        bytes_per_unit=ny * nx * 28 + 2 * render.n_waves * 36 * render.largest**2 + (150 << 20),
+        # the wide PSF of one node, as sampled and as drawn; of the others, and of the core's modes, the samples
+        bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (350 << 20),
         # sky, noise and storage; then objects
         seconds_per_unit=ny * nx * 2.5e-7 + ny * nx * instrument.pixel_scale**2 / 3600 * 600 * 2.5e-4,
     )
 
 
-def cone(corners: np.ndarray) -> tuple[float, float, float]:
-    """Return centre and radius (degrees) of the cone around a footprint, with the reach of light into it."""
+def cone(corners: np.ndarray) -> tuple[float, float, float, float]:
+    """Return centre and radii (degrees) of the cones around a footprint from which galaxies and stars shine on it."""
     vectors = unit_vectors(corners[:, 0], corners[:, 1])
     centre = vectors.sum(axis=0)
     centre /= np.linalg.norm(centre)
     ra, dec = radec(centre)
     radius = np.degrees(2 * np.arcsin(np.linalg.norm(vectors - centre, axis=1).max() / 2))
-    return float(ra), float(dec), float(radius + REACH / 3600)
-
-
-def scene_stamp(scene: Scene, faintest: float, largest: int) -> int:
-    """Return the largest stamp that a scene needs."""
-    brightest = float(scene.fluxes().max(initial=0.0))
-    return largest_stamp(brightest, component_reach(scene, faintest), faintest, largest)
+    return float(ra), float(dec), float(radius + REACH / 3600), float(radius + STAR_REACH / 3600)
 
 
 def header_text(header: dict) -> str:

@@ -88,6 +88,7 @@ _SETTING = {
     "objects": "raise detections.order",
     "matches": "raise matches.order",
     "exposures": "lower render.largest",
+    "truth_index": "lower render.largest",
 }
 """What makes the units of a stage smaller."""
 
@@ -102,6 +103,11 @@ def stages(survey: Survey) -> list[Stage]:
     found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
     found += [
         Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
+        for name, instrument in survey.instruments.items()
+        if instrument.coadd_from == "exposures"
+    ]
+    found += [
+        Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
         for name, instrument in survey.instruments.items()
         if instrument.coadd_from == "exposures"
     ]
@@ -290,7 +296,9 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
         folder = store.record(stage.name, "x").parent
         failed = len(list(folder.glob("*.failed")))
         done = len(store.records(stage.name))
-        known = not stage.name.startswith(("exposures", "coadds", "detections", "objects", "matches", "statistics"))
+        known = not stage.name.startswith(
+            ("exposures", "truth_index", "coadds", "detections", "objects", "matches", "statistics")
+        )
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
         else:

@@ -24,6 +24,7 @@ from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline, load_pipeline
 from romandask.pointings import pointings, visits
+from romandask.psfs import psfs
 from romandask.runtime.manifest import read_record
 from romandask.runtime.products import ImageProduct, TableProduct, conform, to_frame
 from romandask.runtime.schemas import schema
@@ -31,6 +32,7 @@ from romandask.runtime.store import Store, read_parquet
 from romandask.runtime.units import Unit
 from romandask.statistics import Statistics, matrix, statistics
 from romandask.truth import TruthCatalogs, truth
+from romandask.truth_index import truth_index
 
 
 class Survey:
@@ -71,6 +73,14 @@ class Survey:
     def exposures(self, survey: str) -> xr.Dataset:
         """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ..."""
         return self.exposure_product(survey).dataset
+
+    def truth_index(self, survey: str) -> dd.DataFrame:
+        """Return the lazy index of the objects on each exposure (schema: catalogs/truth_index.yaml)."""
+        return self.truth_index_product(survey).frame
+
+    def psfs(self, survey: str) -> xr.Dataset:
+        """Return lazy PSF images (exposure, v, u): a unit star of flat f_nu, sampled 8 times finer than pixels."""
+        return self.psf_product(survey).dataset
 
     def coadds(self, survey: str) -> xr.Dataset:
         """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, psf; coords tile, band, header ..."""
@@ -169,6 +179,14 @@ class Survey:
             survey,
             lambda: exposures(self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed),
         )
+
+    def truth_index_product(self, survey: str) -> TableProduct:
+        """The truth index of an instrument's exposures."""
+        return self._once("truth_index", survey, lambda: truth_index(self.exposure_product(survey)))
+
+    def psf_product(self, survey: str) -> ImageProduct:
+        """The PSF images of an instrument's exposures: made when asked for."""
+        return self._once("psfs", survey, lambda: psfs(self.exposure_product(survey)))
 
     def coadd_product(self, survey: str) -> ImageProduct:
         """The coadds of an instrument."""

@@ -51,17 +51,18 @@ class TruthCatalogs:
     internal_frame: str
     """"rest" or "observed": where the galaxies' own dust acts."""
 
-    def near(self, ra: float, dec: float, radius: float) -> Truth:
-        """Return the rows around a cone (degrees), with their spectra: no more of a partition than the cone needs."""
-        galaxies, stars = (_rows_near(product, ra, dec, radius) for product in (self.galaxies, self.stars))
+    def near(self, ra: float, dec: float, radius: float, stars_radius: float) -> Truth:
+        """Return the rows around cones (degrees), with their spectra: no more of a partition than the cones need."""
+        galaxies = _rows_near(self.galaxies, ra, dec, radius)
+        stars = _rows_near(self.stars, ra, dec, stars_radius)
         return bind(galaxies, stars, self.library, self.edges, self.internal_frame)
 
-    def inputs(self, ra: float, dec: float, radius: float) -> tuple[tuple[str, str], ...]:
+    def inputs(self, ra: float, dec: float, radius: float, stars_radius: float) -> tuple[tuple[str, str], ...]:
         """Return the units that `near` reads."""
         return tuple(
             (product.stage, product.names[index])
-            for product in (self.galaxies, self.stars)
-            for index in product.touching(cells_in_cone(ra, dec, radius, product.order or 0))
+            for product, reach in ((self.galaxies, radius), (self.stars, stars_radius))
+            for index in product.touching(cells_in_cone(ra, dec, reach, product.order or 0))
         )
 
 

@@ -19,6 +19,7 @@ LAYERS = [
     {"pipeline", "statistics"},
     {"matches", "detections"},
     {"coadds"},
+    {"truth_index", "psfs"},
     {"exposures"},
     {"pointings", "truth"},
     {"generated", "incoming"},

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Literal, Protocol
 
+import galsim
 import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 from numpy.polynomial.chebyshev import chebvander
 
 from romandask.kernels.detector import Detector
-from romandask.kernels.psf import PsfBasis
+from romandask.kernels.psf import BrightPsf, PsfModel
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
@@ -107,8 +108,20 @@ class Instrument(Protocol):
     def header(self, exposure: Exposure) -> dict:
         """Return the exact FITS header of an exposure."""
 
-    def psf(self, exposure: Exposure, size: int) -> PsfBasis:
-        """Return the chromatic PSF of an exposure for stamps up to `size` pixels."""
+    def psf(self, exposure: Exposure) -> PsfModel:
+        """Return the chromatic PSF of an exposure."""
+
+    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
+        """Return the PSF at one place, exactly: of no use elsewhere, and sooner made than the whole."""
+
+    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
+        """Return `edges` of that PSF, without the work of the whole."""
+
+    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
+        """Return the PSFs of its bright stars, the brightest last."""
+
+    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
+        """Return GalSim's PSFs (arcsec, in the frame of the pixels, without their response), one a node, at a place."""
 
     def background(self, exposure: Exposure, header: dict, rows: slice = ..., columns: slice = ...) -> np.ndarray:
         """Return the expected electrons (ny, nx) that do not come from objects, of all or some pixels."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
@@ -20,7 +21,17 @@ from romandask.instruments.roman_plan import reference_plan
 from romandask.instruments.roman_sun import FURTHEST, NEAREST, sun_angle
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
-from romandask.kernels.psf import PsfBasis, sample_basis
+from romandask.kernels.psf import (
+    CORE_MODES,
+    BrightPsf,
+    Grid,
+    PsfModel,
+    Variation,
+    edge_brightness,
+    model,
+    place_grid,
+    sample,
+)
 from romandask.model.config import Section
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
@@ -48,6 +59,12 @@ class RomanSettings(Section):
     bands: tuple[Literal["Y106", "J129", "H158", "F184"], ...] = ("Y106", "J129", "H158", "F184")
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple"] = "simple"
+    psf_variation: bool = Field(True, description="the PSF varies over each SCA; false: that of its middle everywhere")
+    bright_stars: dict[float, Literal[1, 2, 4]] = Field(
+        {15.0: 4, 12.0: 2},
+        description="stars brighter than each magnitude: pupil pixels binned for their PSF (8 for all else)",
+    )
+    charge_diffusion: float = Field(0.0, ge=0, le=2, description="sigma, pixels, by which charge diffuses; 0 for none")
 
     @model_validator(mode="after")
     def _every_band_dithered(self) -> RomanSettings:
@@ -105,9 +122,44 @@ class Roman:
         """Return the exact TAN-SIP header of an exposure."""
         return header_of(exposure.detector, exposure.ra, exposure.dec, exposure.pa)
 
-    def psf(self, exposure: Exposure, size: int) -> PsfBasis:
-        """Return the PSF basis of an exposure, for stamps up to `size`: one PSF an SCA and band, as in the paper."""
-        return _psf(exposure.detector, exposure.band, self.n_waves, size)
+    def psf(self, exposure: Exposure) -> PsfModel:
+        """Return the PSF of an SCA and band, as it varies over the SCA."""
+        settings = self.settings
+        return _psf(exposure.detector, exposure.band, self.n_waves, settings.psf_variation, settings.charge_diffusion)
+
+    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
+        """Return the PSF at one place of the SCA, on stamps of up to the core's size."""
+        if not self.settings.psf_variation:
+            x, y = _MIDDLE.x - 0.5, _MIDDLE.y - 0.5
+        grid, diffusion = Grid(CORE_MODES, FOLDS[exposure.band]), self.settings.charge_diffusion
+        profiles = self.profiles(exposure, x, y)
+        return model(np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles]), grid)
+
+    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
+        """Return how bright a unit star is at the edges of stamps."""
+        return _edges(exposure.detector, exposure.band, self.n_waves, self.settings.charge_diffusion)
+
+    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
+        """Return the PSFs of bright stars: of finer pupils, which reach further out (paper, section 4.2)."""
+        bandpass, diffusion = self.bandpass(exposure.band), self.settings.charge_diffusion
+        zero = bandpass.ab_photons() * exposure.exptime
+        found = []
+        for magnitude, pupil_bin in sorted(self.settings.bright_stars.items(), reverse=True):
+            # a star whose core is far beyond saturation is known by its spikes: fewer wavelengths will do
+            waves = bandpass.nodes if pupil_bin == 4 else np.linspace(bandpass.nodes[0], bandpass.nodes[-1], 3)
+            place = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
+            shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(waves))), 0, 1)
+            # of the finest frequencies in the shortest band their cores alone have any
+            grid = Grid(_EXTENT // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
+            nodes = _WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
+            found.append(BrightPsf(zero * 10 ** (-0.4 * magnitude), grid, nodes, shares))
+        return tuple(found)
+
+    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
+        """Return GalSim's PSFs at a place (pixels, 0 at the first pixel's centre), one a node."""
+        nodes = roman_bandpass(exposure.band, self.n_waves).nodes
+        place = galsim.PositionD(x + 0.5, y + 0.5)
+        return [_optics(exposure.detector, exposure.band, wave, 8, place) for wave in nodes]
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current."""
@@ -135,8 +187,57 @@ def _date(mjd: float):
 roman_psfs._make_aperture.resize(1)
 
 
+FOLDS = {"Y106": 3, "J129": 2, "H158": 2, "F184": 2}
+"""How many times the pixels' Nyquist frequency the optics reach in each band."""
+_EXTENT = 4096
+"""Pixels, a side, that a PSF of the unbinned pupil covers; one of a binned pupil covers so many times less."""
+_MIDDLE = galsim.PositionD(SIDE / 2, SIDE / 2)
+
+
+def _optics(sca: int, band: str, wave: float, pupil_bin: int, place: galsim.PositionD = _MIDDLE) -> galsim.GSObject:
+    return galsim.roman.getPSF(sca, band, SCA_pos=place, pupil_bin=pupil_bin, wavelength=wave)
+
+
+@lru_cache(maxsize=128)
+def _edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, float]:
+    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(_EXTENT // 8, FOLDS[band])
+    ends = [sample(_optics(sca, band, wave, 8), galsim.roman.pixel_scale, grid, diffusion) for wave in waves[[0, -1]]]
+    return edge_brightness(np.array(ends), grid)
+
+
 @lru_cache(maxsize=1)
-def _psf(sca: int, band: str, n_waves: int, size: int) -> PsfBasis:
-    nodes = roman_bandpass(band, n_waves).nodes
-    profiles = [galsim.roman.getPSF(sca, band, pupil_bin=8, wavelength=wave) for wave in nodes]
-    return sample_basis(profiles, galsim.roman.pixel_scale, size)
+def _psf(sca: int, band: str, n_waves: int, varies: bool, diffusion: float) -> PsfModel:
+    waves = roman_bandpass(band, n_waves).nodes
+    scale = galsim.roman.pixel_scale
+    grid = Grid(_EXTENT // 8, FOLDS[band])
+    core = Grid(CORE_MODES, FOLDS[band])
+    varied = tuple(sorted({0, n_waves // 2, n_waves - 1})) if varies else ()
+    nodes = np.empty((n_waves, *grid.shape), np.complex64)
+    differences = np.empty((len(varied), 8, *core.shape), np.complex64)
+    # by wavelength, for GalSim keeps the pupil of one
+    for node, wave in enumerate(waves):
+        nodes[node] = sample(_optics(sca, band, wave, 8), scale, grid, diffusion)
+        if node in varied:
+            middle = grid.within(nodes[node : node + 1], core.size)[0]
+            for place, (x, y) in enumerate(place_grid((SIDE, SIDE))):
+                there = _optics(sca, band, wave, 8, galsim.PositionD(x + 0.5, y + 0.5))
+                differences[varied.index(node), place] = sample(there, scale, core, diffusion) - middle
+    return model(nodes, grid, Variation((SIDE, SIDE), varied, differences) if varies else None)
+
+
+@dataclass(frozen=True)
+class _WideNodes:
+    """Samples, one after another, the PSFs of a finer pupil."""
+
+    sca: int
+    band: str
+    waves: tuple[float, ...]
+    """nm"""
+    pupil_bin: int
+    grid: Grid
+    diffusion: float
+
+    def __call__(self) -> Iterator[np.ndarray]:
+        for wave in self.waves:
+            profile = _optics(self.sca, self.band, wave, self.pupil_bin)
+            yield sample(profile, galsim.roman.pixel_scale, self.grid, self.diffusion)

@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import galsim
 import numpy as np
 import pandas as pd
 from pydantic import Field, model_validator
+from scipy.special import gamma, kv
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.rubin_cadence import cadence
 from romandask.kernels.bandpasses import rubin_bandpass
 from romandask.kernels.depth import SYSTEM_FWHM
 from romandask.kernels.detector import Detector
-from romandask.kernels.psf import PsfBasis, radial_basis
+from romandask.kernels.psf import BrightPsf, PsfModel, radial_model
 from romandask.model.config import Section
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
@@ -25,6 +27,8 @@ AREA = np.pi / 4 * 642.3**2
 """Effective collecting area, cm2."""
 DARK = 0.2
 """Electrons a second."""
+STAMP = 512
+"""Largest stamp, pixels."""
 MARGIN = 0.3
 """Degrees by which tiles may stick out of the region that they cover."""
 
@@ -50,6 +54,8 @@ class RubinSettings(Section):
     bands: tuple[Band, ...] = ("u", "g", "r", "i", "z", "y")
     mode: Literal["coadd"] = "coadd"
     pointings: RubinPointings = RubinPointings()
+    atmosphere: Literal["kolmogorov", "von_karman"] = "kolmogorov"
+    outer_scale: float = Field(25.0, gt=1, description="outer scale of von Karman turbulence, m")
 
     @model_validator(mode="after")
     def _every_band_visited(self) -> RubinSettings:
@@ -127,12 +133,38 @@ class Rubin:
         """Return the header of an exposure: gnomonic about the boresight, +y at the position angle `pa`."""
         return _header(exposure, exposure.detector, self.shape)
 
-    def psf(self, exposure: Exposure, size: int) -> PsfBasis:
-        """Return the PSF basis of an exposure: Kolmogorov atmosphere and Gaussian system, both with airmass^0.6."""
-        return self.effective_psf([exposure], np.ones(1), size)
+    def psf(self, exposure: Exposure) -> PsfModel:
+        """Return the PSF of an exposure: atmosphere and Gaussian system, both with airmass^0.6."""
+        return self.effective_psf([exposure], np.ones(1))
 
-    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray, size: int) -> PsfBasis:
-        """Return the basis of the weighted mean PSF of some exposures of one band, on this instrument's pixels."""
+    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
+        """Return the PSF of an exposure: it is the same everywhere."""
+        return self.psf(exposure)
+
+    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
+        """Return how bright a unit star is at the edges of stamps."""
+        return self.psf(exposure).edges
+
+    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
+        """Return no PSFs of bright stars: seeing is the same for all."""
+        return ()
+
+    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
+        """Return GalSim's PSFs, one a node: the same at every place (pixels) of the detector."""
+        thickness = exposure.airmass**0.6
+        system = galsim.Gaussian(fwhm=SYSTEM_FWHM * thickness)
+        return [
+            galsim.Convolve(self._atmosphere(exposure.seeing * (wave / 500) ** -0.3 * thickness, wave), system)
+            for wave in self.bandpass(exposure.band).nodes
+        ]
+
+    def _atmosphere(self, fwhm: float, wave: float) -> galsim.GSObject:
+        if self.settings.atmosphere == "kolmogorov":
+            return galsim.Kolmogorov(fwhm=float(fwhm))
+        return galsim.VonKarman(lam=float(wave), r0=fried(fwhm, wave), L0=self.settings.outer_scale)
+
+    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray, size: int = STAMP) -> PsfModel:
+        """Return the weighted mean PSF of some exposures of one band, on this instrument's pixels."""
         nodes = self.bandpass(exposures[0].band).nodes
         share = np.asarray(weights) / np.sum(weights)
         seeing = np.array([exposure.seeing for exposure in exposures])
@@ -141,10 +173,14 @@ class Rubin:
         transfers = []
         for wave in nodes:
             fwhm = seeing * (wave / 500) ** -0.3 * thickness
-            transfers.append(
-                share @ kolmogorov_transfer(frequency[None], fwhm[:, None], SYSTEM_FWHM * thickness[:, None])
-            )
-        return radial_basis(frequency, np.array(transfers), SCALE, size)
+            system = SYSTEM_FWHM * thickness[:, None]
+            if self.settings.atmosphere == "kolmogorov":
+                transfer = kolmogorov_transfer(frequency[None], fwhm[:, None], system)
+            else:
+                outer = self.settings.outer_scale
+                transfer = von_karman_transfer(frequency[None], fwhm[:, None], system, wave, outer)
+            transfers.append(share @ transfer)
+        return radial_model(frequency, np.array(transfers), SCALE, size)
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of sky and dark current."""
@@ -169,6 +205,27 @@ def kolmogorov_transfer(frequency: np.ndarray, atmosphere: np.ndarray, system: n
     """
     kolmogorov = np.exp(-3.4418970 * (frequency * atmosphere / (2 * np.pi * 0.9758634299)) ** (5 / 3))
     return kolmogorov * np.exp(-((frequency * system / 2.3548200450309493) ** 2) / 2)
+
+
+def fried(fwhm: np.ndarray | float, wave: float) -> np.ndarray | float:
+    """Return r0, m, of Kolmogorov seeing of a FWHM, arcsec, at a wavelength, nm (Fried 1966)."""
+    return 0.9758634299 * wave * 1e-9 / (fwhm * np.pi / 648000)
+
+
+def von_karman_transfer(
+    frequency: np.ndarray, atmosphere: np.ndarray, system: np.ndarray, wave: float, outer_scale: float
+) -> np.ndarray:
+    """Return the transform of von Karman seeing and a Gaussian: turbulence whose power ends at an outer scale.
+
+    Arguments and units are those of `kolmogorov_transfer`, `atmosphere` the FWHM without the outer scale; `wave` in nm,
+    `outer_scale` in m. The structure function is Conan's (2008, equation 16).
+    """
+    separation = np.maximum(frequency * (648000 / np.pi) * wave * 1e-9 / (2 * np.pi), 1e-9)
+    x = 2 * np.pi * separation / outer_scale
+    constant = 2 ** (1 / 6) * gamma(11 / 6) / np.pi ** (8 / 3) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
+    structure = (outer_scale / fried(atmosphere, wave)) ** (5 / 3) * constant
+    structure = structure * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x))
+    return np.exp(-structure / 2) * np.exp(-((frequency * system / 2.3548200450309493) ** 2) / 2)
 
 
 def detector_centres() -> np.ndarray:

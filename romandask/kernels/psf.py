@@ -1,94 +1,318 @@
-"""Chromatic PSF bases: PSFs at a few wavelengths, sampled in Fourier space once for all stamp sizes."""
+"""Chromatic PSFs that vary over a detector, sampled in Fourier space once for all stamp sizes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import galsim
 import numpy as np
 from scipy import fft
 
+from romandask.kernels.fourier import Frequencies, frequencies
+
+_NEGLIGIBLE = 1e-7
+"""Surface brightness of a unit star, 1/pixel, below which a mode of the PSF's variation is left out."""
+CORE_MODES = 256
+"""Largest stamp, pixels, on which the variation over the detector is followed."""
+
 
 @dataclass(frozen=True)
-class PsfBasis:
-    """PSFs, pixel response included, at the nodes of a band, as transforms on a common grid.
+class Grid:
+    """Frequencies at which transforms are sampled.
 
     A stamp of N pixels needs frequencies 2 pi j / N; those of every power-of-two stamp up to `size` lie on the
     grid of the largest, so smaller stamps stride through it.
     """
 
-    transforms: np.ndarray
-    """(nodes, folds * size, folds * size / 2 + 1) complex64; rows are j_y = -folds * size / 2 ..., columns j_x = 0 ...;
-    1 at zero frequency."""
     size: int
     """Largest stamp, pixels a side, a power of two."""
     folds: int
     """The transforms reach `folds` times the pixel grid's Nyquist frequency."""
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows j_y = -folds size / 2 ..., columns j_x = 0 ..., of frequencies 2 pi j / size."""
+        return self.folds * self.size, self.folds * self.size // 2 + 1
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the frequencies of rows and columns, radians a pixel."""
+        rows = 2 * np.pi * np.arange(-self.shape[0] // 2, self.shape[0] // 2) / self.size
+        return rows, 2 * np.pi * np.arange(self.shape[1]) / self.size
+
+    def within(self, transforms: np.ndarray, size: int) -> np.ndarray:
+        """Return the transforms for stamps of at most `size` pixels."""
+        stride = self.size // size
+        return transforms[:, ::stride, ::stride]
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How the PSF differs from that in the middle of the detector, on a grid of 3 x 3 places, at some of the nodes.
+
+    Between the places it is a parabola along each axis, between the nodes one in wavelength (a line for two).
+    """
+
+    shape: tuple[int, int]
+    """Detector (ny, nx)."""
+    nodes: tuple[int, ...]
+    differences: np.ndarray
+    """(nodes, 8, rows, columns) complex64 on the grid of the core: places in rows, the middle one left out."""
+
+
+@dataclass(frozen=True)
+class BrightPsf:
+    """The PSF of the brightest stars, in more detail and further out, in the middle of a detector."""
+
+    least: float
+    """Electrons from which on a star is drawn with it."""
+    grid: Grid
+    nodes: Callable[[], Iterator[np.ndarray]]
+    """Returns the transforms (grid.shape), one at a time: they are large."""
+    shares: np.ndarray
+    """(nodes of the band, nodes of this PSF): how the light of the band's nodes is shared among its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class PsfModel:
+    """PSFs, pixel response included, of one detector and band: at the band's nodes, and over the detector."""
+
+    nodes: np.ndarray
+    """(nodes, *grid.shape) complex64: in the middle of the detector; 1 at zero frequency."""
+    grid: Grid
+    core: Grid
+    """That of stamps on which the variation over the detector is followed."""
+    modes: np.ndarray
+    """(modes, *core.shape) complex64: the first has the light, the others none."""
+    mixing: np.ndarray
+    """(nodes + 8 * varied, modes): each sampled PSF, or difference from that in the middle, as a sum of modes."""
+    peaks: np.ndarray
+    """(modes,) largest surface brightness, 1/pixel, of each."""
+    varied: tuple[int, ...] = ()
+    """Nodes at which the variation was sampled."""
+    shape: tuple[int, int] = (1, 1)
+    """Detector (ny, nx)."""
+
+    def weights(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the modes' weights (n, modes), float32, of light (n, nodes) at places on the detector."""
+        parts = [photons]
+        if self.varied:
+            light = photons @ lagrange(np.arange(photons.shape[1]), np.array(self.varied, float)).astype(photons.dtype)
+            places = places_of(x, y, self.shape)
+            parts.append((light[:, :, None] * places[:, None, :]).reshape(len(photons), -1))
+        return (np.concatenate(parts, axis=1) @ self.mixing).astype(np.float32)
+
+    def at(self, node: int, x: float, y: float) -> np.ndarray:
+        """Return the transform (core.shape) of the PSF of one node at a place."""
+        light = np.zeros((1, len(self.nodes)))
+        light[0, node] = 1.0
+        return np.tensordot(self.weights(light, np.array([x]), np.array([y]))[0], self.modes, 1)
+
+    @lru_cache(maxsize=16)  # noqa: B019 - a model lives as long as its detector is drawn
+    def frequencies(self, stamp: int) -> Frequencies:
+        """Return the modes at the frequencies of a stamp of at most core.size pixels."""
+        return stamp_frequencies(self.modes, self._images, self.core, stamp)
+
     @cached_property
-    def edge_brightness(self) -> dict[int, float]:
-        """Largest surface brightness (1/pixel) of a unit star, at the first or last node, at the edge of each stamp."""
-        edges: dict[int, float] = {}
-        for transform in self.transforms[[0, -1]]:
-            image = np.abs(_aliased_image(transform, self.size, self.folds))
-            offset = np.abs(np.arange(self.size) - self.size // 2)
-            ring = np.maximum(offset[:, None], offset[None, :])
-            size = 16
-            while size <= self.size:
-                # a ring a few pixels wide, for the diffraction rings have nulls
-                width = max(size // 16, 2)
-                at_edge = image[(ring <= size // 2) & (ring > size // 2 - width)].max()
-                edges[size] = max(edges.get(size, 0.0), float(at_edge))
-                size *= 2
-        return edges
+    def _images(self) -> np.ndarray:
+        """The modes as images, sampled finer than pixels by core.folds."""
+        return np.stack([star_image(mode, self.core, self.core.folds) for mode in self.modes])
+
+    @cached_property
+    def edges(self) -> dict[int, float]:
+        """As `edge_brightness`."""
+        return edge_brightness(self.nodes[[0, -1]], self.grid)
 
 
-def _aliased_image(transform: np.ndarray, size: int, folds: int) -> np.ndarray:
-    """Return the centred (size, size) image of a unit star."""
-    grid = folds * size
-    full = fft.irfft2(np.fft.ifftshift(transform, axes=0), s=(grid, grid))
+def stamp_frequencies(transforms: np.ndarray, images: np.ndarray, grid: Grid, stamp: int) -> Frequencies:
+    """Return PSFs at the frequencies of a stamp: of their light that which falls on it when they are in its middle.
+
+    A transform sampled at a small stamp's frequencies would fold the light from beyond its edges into it.
+
+    Parameters
+    ----------
+    transforms : (n, *grid.shape)
+    images : (n, folds size, folds size): the same as images, sampled finer than pixels by grid.folds
+    """
+    stride = grid.size // stamp
+    power = np.abs(transforms[:, ::stride, ::stride]).max(axis=0)
+    seen = power > 1e-7 * power.max()
+    if stride == 1:
+        return frequencies(transforms, seen, stamp)
+    middle, half = images.shape[1] // 2, grid.folds * stamp // 2
+    part = images[:, middle - half : middle + half, middle - half : middle + half]
+    cut = fft.rfft2(fft.ifftshift(part, axes=(1, 2))) / grid.folds**2
+    return frequencies(fft.fftshift(cut, axes=1), seen, stamp)
+
+
+def edge_brightness(transforms: np.ndarray, grid: Grid) -> dict[int, float]:
+    """Return the largest surface brightness (1/pixel) of a unit star with any of some PSFs at the edge of each stamp.
+
+    Parameters
+    ----------
+    transforms : (n, *grid.shape): of the first and the last node, say
+    """
+    found: dict[int, float] = {}
+    offset = np.abs(np.arange(grid.size) - grid.size // 2)
+    ring = np.maximum(offset[:, None], offset[None, :])
+    for transform in transforms:
+        image = np.abs(star_image(transform, grid))
+        size = 16
+        while size <= grid.size:
+            # a ring a few pixels wide, for the diffraction rings have nulls
+            width = max(size // 16, 2)
+            at_edge = image[(ring <= size // 2) & (ring > size // 2 - width)].max()
+            found[size] = max(found.get(size, 0.0), float(at_edge))
+            size *= 2
+    return found
+
+
+def star_image(transform: np.ndarray, grid: Grid, fine: int = 1) -> np.ndarray:
+    """Return the image (size, size) of a unit star centred on the pixel size / 2; sampled finer by `fine` if asked."""
+    side = grid.folds * grid.size
+    full = fft.fftshift(fft.irfft2(np.fft.ifftshift(transform, axes=0), s=(side, side)))
     # sampling an image finer by `folds` at pixel centres is folding its transform
-    return np.fft.fftshift(full[::folds, ::folds]) * folds**2
+    return full[:: grid.folds // fine, :: grid.folds // fine] * grid.folds**2
 
 
-def sample_basis(profiles: list[galsim.GSObject], pixel_scale: float, size: int) -> PsfBasis:
-    """Sample PSF profiles (arcsec, in the frame of the pixels), convolved with the pixel, up to stamps of `size`.
+def fine_image(psf: PsfModel, shares: np.ndarray, x: float, y: float, side: int, oversampling: int) -> np.ndarray:
+    """Return the image (side * oversampling, square) of a unit star at a place, sampled finer than its pixels.
+
+    Parameters
+    ----------
+    shares : (nodes,) of the star's light by node; they sum to 1
+    side : native pixels that the image covers
+    oversampling : samples along a pixel; the star is centred on sample side * oversampling / 2
+    """
+    weights = psf.weights(np.asarray(shares, float)[None], np.array([x]), np.array([y]))[0]
+    transform = np.tensordot(weights, psf.modes, 1)
+    rows, columns = psf.core.shape
+    # frequencies beyond the optics' reach are empty: padded with zeros they make finer samples
+    fine = max(rows, psf.core.size * oversampling)
+    padded = np.zeros((fine, fine // 2 + 1), np.complex64)
+    padded[fine // 2 - rows // 2 : fine // 2 + rows // 2, :columns] = transform
+    image = fft.fftshift(fft.irfft2(np.fft.ifftshift(padded, axes=0), s=(fine, fine))) * (fine / psf.core.size) ** 2
+    step = fine // (psf.core.size * oversampling)
+    image = image[::step, ::step]
+    middle, half = image.shape[0] // 2, side * oversampling // 2
+    return image[middle - half : middle + half, middle - half : middle + half]
+
+
+def lagrange(at: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the weights (n, k) of the values at k nodes, of the polynomial through all of them, at n places."""
+    weights = np.ones((len(at), len(nodes)))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            weights[:, k] *= (at - other) / (node - other)
+    return weights
+
+
+def places_of(x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the weights (n, 8) of the places around the middle; an object off the detector is as at its edge."""
+    nodes = np.array([0.0, 0.5, 1.0])
+    across, up = (
+        lagrange(np.clip((np.asarray(value) + 0.5) / side, 0, 1), nodes)
+        for value, side in zip((x, y), shape[::-1], strict=True)
+    )
+    return np.delete((up[:, :, None] * across[:, None, :]).reshape(-1, 9), 4, axis=1)
+
+
+def place_grid(shape: tuple[int, int]) -> list[tuple[float, float]]:
+    """Return the eight places (x, y), 0 at the centre of the first pixel, at which the variation is sampled."""
+    ny, nx = shape
+    every = [(i * nx / 2 - 0.5, j * ny / 2 - 0.5) for j in range(3) for i in range(3)]
+    return every[:4] + every[5:]
+
+
+def sample(profile: galsim.GSObject, pixel_scale: float, grid: Grid, diffusion: float = 0.0) -> np.ndarray:
+    """Return the transform (grid.shape), complex64, of a profile (arcsec) convolved with the response of a pixel.
+
+    Parameters
+    ----------
+    diffusion : sigma, pixels, of the Gaussian by which charge diffuses before it is collected; 0 for none
+    """
+    rows, columns = grid.shape
+    # half the plane is enough, which GalSim's underscored method, alone, can draw
+    bounds = galsim.BoundsI(0, columns - 2, -rows // 2, rows // 2 - 1)
+    image = galsim.ImageCF(bounds, scale=2 * np.pi / (grid.size * pixel_scale))
+    profile._drawKImage(image)
+    out = np.zeros(grid.shape, np.complex64)
+    # the last column, half the sampling frequency of the folded grid, is beyond every profile's reach
+    np.multiply(image.array, _response(grid, diffusion)[:, :-1], out=out[:, :-1])
+    out[0] = 0
+    return out
+
+
+def _response(grid: Grid, diffusion: float) -> np.ndarray:
+    """Return the transform of a square pixel and of the diffusion of charge."""
+    up, across = (np.sinc(axis / (2 * np.pi)) * np.exp(-((axis * diffusion) ** 2) / 2) for axis in grid.axes())
+    return (up[:, None] * across[None, :]).astype(np.float32)
+
+
+def folds_of(profiles: list[galsim.GSObject], pixel_scale: float) -> int:
+    """Return how many times the Nyquist frequency of the pixels the transforms of profiles reach."""
+    reach = max(profile.maxk for profile in profiles) * pixel_scale
+    return int(np.clip(np.ceil(reach / np.pi), 1, 4))
+
+
+def sample_model(profiles: list[galsim.GSObject], pixel_scale: float, size: int, diffusion: float = 0.0) -> PsfModel:
+    """Return the model of PSF profiles (arcsec, in the frame of the pixels), one a node, the same everywhere.
 
     Parameters
     ----------
     profiles : unit-flux GalSim profiles, one a node
     pixel_scale : arcsec
     size : largest stamp, pixels a side, a power of two
+    diffusion : sigma of charge diffusion, pixels
     """
-    reach = max(profile.maxk for profile in profiles) * pixel_scale
-    folds = int(np.clip(np.ceil(reach / np.pi), 1, 4))
-    grid = folds * size
-    frequency = 2 * np.pi * np.arange(-grid // 2, grid // 2) / size
-    pixel = np.sinc(frequency / (2 * np.pi))
-    response = (pixel[:, None] * np.sinc(frequency[grid // 2 :] / (2 * np.pi))[None, :]).astype(np.float32)
-    transforms = np.zeros((len(profiles), grid, grid // 2 + 1), np.complex64)
-    for out, profile in zip(transforms, profiles, strict=True):
-        # half the plane is enough, which GalSim's underscored method, alone, can draw
-        bounds = galsim.BoundsI(0, grid // 2 - 1, -grid // 2, grid // 2 - 1)
-        image = galsim.ImageCF(bounds, scale=2 * np.pi / (size * pixel_scale))
-        profile._drawKImage(image)
-        # the last column, half the sampling frequency of the folded grid, is beyond every profile's reach
-        np.multiply(image.array, response, out=out[:, :-1])
-    transforms[:, 0, :] = 0
-    return PsfBasis(transforms, size, folds)
+    grid = Grid(size, folds_of(profiles, pixel_scale))
+    return model(np.stack([sample(profile, pixel_scale, grid, diffusion) for profile in profiles]), grid)
 
 
-def radial_basis(frequency: np.ndarray, transfers: np.ndarray, pixel_scale: float, size: int) -> PsfBasis:
-    """Return the basis of round PSFs from their transforms (nodes, n) at radial frequencies (n,), 1/arcsec."""
-    folds = 2
-    grid = folds * size
-    rows = 2 * np.pi * np.arange(-grid // 2, grid // 2) / size
-    columns = rows[grid // 2 :]
-    response = np.sinc(rows / (2 * np.pi))[:, None] * np.sinc(columns / (2 * np.pi))[None, :]
+def radial_model(
+    frequency: np.ndarray, transfers: np.ndarray, pixel_scale: float, size: int, diffusion: float = 0.0
+) -> PsfModel:
+    """Return the model of round PSFs from their transforms (nodes, n) at radial frequencies (n,), 1/arcsec."""
+    grid = Grid(size, 2)
+    rows, columns = grid.axes()
+    response = _response(grid, diffusion)
     radius = np.hypot(rows[:, None], columns[None, :]) / pixel_scale
-    transforms = np.zeros((len(transfers), grid, grid // 2 + 1), np.complex64)
+    transforms = np.zeros((len(transfers), *grid.shape), np.complex64)
     for out, transfer in zip(transforms, transfers, strict=True):
-        out[:, :-1] = np.interp(radius, frequency, transfer, right=0.0) * response
+        out[:] = np.interp(radius, frequency, transfer, right=0.0) * response
     transforms[:, 0, :] = 0
-    return PsfBasis(transforms, size, folds)
+    transforms[:, :, -1] = 0
+    return model(transforms, grid)
+
+
+def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> PsfModel:
+    """Return the model of sampled PSFs: their mean and the principal modes of what they differ by."""
+    core = Grid(min(grid.size, CORE_MODES), grid.folds)
+    centre = grid.within(nodes, core.size)
+    mean = centre.mean(axis=0)
+    rest = (centre - mean).reshape(len(nodes), -1)
+    if variation is not None:
+        rest = np.concatenate([rest, variation.differences.reshape(-1, rest.shape[1])])
+    # columns but the first stand for two frequencies each
+    weight = np.full(core.shape, 2.0, np.float32)
+    weight[:, 0] = 1.0
+    gram = ((rest * weight.ravel()) @ rest.conj().T).real
+    power, vectors = np.linalg.eigh(gram.astype(float))
+    strongest = np.argsort(power)[::-1]
+    strongest = strongest[power[strongest] > 1e-12 * power.max(initial=1e-30)]
+    modes = (vectors[:, strongest].T.astype(np.float32) @ rest).reshape(-1, *core.shape)
+    peaks = np.array([np.abs(star_image(mode, core, core.folds)).max() for mode in modes])
+    largest = peaks * np.abs(vectors[:, strongest]).max(axis=0, initial=0.0)
+    kept = largest > _NEGLIGIBLE
+    mixing = vectors[:, strongest][:, kept]
+    light = np.zeros((len(rest), 1))
+    light[: len(nodes)] = 1.0
+    return PsfModel(
+        nodes, grid, core,
+        np.concatenate([mean[None], modes[kept]]).astype(np.complex64),
+        np.concatenate([light, mixing], axis=1).astype(np.float32),
+        np.concatenate([[np.abs(star_image(mean, core, core.folds)).max()], peaks[kept]]),
+        variation.nodes if variation is not None else (),
+        variation.shape if variation is not None else (1, 1),
+    )  # fmt: skip

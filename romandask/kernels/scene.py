@@ -8,11 +8,24 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
+from romandask.kernels.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
 from romandask.kernels.photometry import Dust, Spectra, no_dust, node_photons
-from romandask.kernels.render import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, Scene
+from romandask.kernels.render import Scene
 from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra
 
 COMPONENTS = ("bulge", "disk", "knots")
+
+
+DRAWN = ""
+NO_PLACE = "position that the image's WCS cannot reach"
+BAD_SIZE = "size that is not a positive number"
+BAD_LENSING = "shear and convergence beyond weak lensing, or not numbers"
+BAD_FLUX = "flux that is not a number or overflows"
+NO_LIGHT = "no light in this band"
+OFF_IMAGE = "no light on the image"
+"""Why an object is not drawn."""
+MOST_FLUX = 1e15
+"""Electrons, beyond which the image could not hold an object with any precision."""
 
 
 @dataclass(frozen=True)
@@ -131,40 +144,134 @@ def pixel_positions(wcs: WCS, ra, dec) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return x, y, np.linalg.inv(jacobian)
 
 
-def build_scene(truth: Truth, wcs: WCS, bandpass: Bandpass, exptime: float, knot_smoothing: float) -> Scene:
+@dataclass(frozen=True)
+class Drawable:
+    """The objects of a truth that can be drawn on an image, and why the others cannot."""
+
+    scene: Scene
+    rows: np.ndarray
+    """(n,) which of the truth's objects, galaxies before stars, each of the scene is; ascending."""
+    reasons: np.ndarray
+    """(all objects of the truth,) DRAWN where an object is in the scene, else why it is not; object dtype."""
+    x: np.ndarray
+    """(all objects,) pixel coordinate, 0 at the centre of the first pixel; NaN where the WCS has none."""
+    y: np.ndarray
+    """(all objects,)"""
+
+
+def build_scene(
+    truth: Truth,
+    wcs: WCS,
+    bandpass: Bandpass,
+    exptime: float,
+    knot_smoothing: float,
+    within: tuple[tuple[int, int], float] | None = None,
+) -> Drawable:
     """Return the scene of an image.
 
     Parameters
     ----------
     exptime : seconds (electrons = photons per second times this)
     knot_smoothing : sigma, arcsec, of the Gaussian that smooths each knot before lensing; 0 for none
+    within : shape of the image, and how far, pixels, from it objects are kept; None for all
+
+    Objects that cannot be drawn are left out, each with a reason: no value of theirs reaches a pixel.
     """
     galaxies, stars = truth.galaxies, truth.stars
-    x, y, to_pixels = pixel_positions(wcs, np.r_[galaxies["ra"], stars["ra"]], np.r_[galaxies["dec"], stars["dec"]])
-    n, m = len(galaxies), len(stars)
-    parts = [_Part(np.arange(n, n + m), POINT, np.zeros((m, 2, 2)), star_photons(truth, bandpass))]
-    kinds = {"bulge": DEVAUCOULEURS, "disk": EXPONENTIAL, "knots": KNOTS}
-    for component in COMPONENTS:
-        shape, lens = shape_matrices(galaxies, component)
-        photons = galaxy_photons(truth, bandpass, component)
-        rows = np.flatnonzero(photons.sum(axis=1) > 0)
-        parts.append(_Part(rows, kinds[component], (to_pixels[:n] @ lens @ shape)[rows], photons[rows]))
-        if component == "knots":
-            smoothing = (to_pixels[:n] @ lens)[rows] * knot_smoothing
-            counts = galaxies["n_knots"].fillna(0).to_numpy(int)[rows]
-    owner = np.concatenate([part.owner for part in parts])
-    order = np.argsort(owner, kind="stable")
-    blank = sum(len(part.owner) for part in parts[:-1])
-    return Scene(
-        x=x,
-        y=y,
-        key=np.r_[galaxies["galaxy_id"].to_numpy(np.int64), stars["id"].to_numpy(np.int64)].astype(np.uint64),
+    n = len(galaxies)
+    ra, dec = np.r_[galaxies["ra"], stars["ra"]].astype(float), np.r_[galaxies["dec"], stars["dec"]].astype(float)
+    x, y, to_pixels = pixel_positions(wcs, ra, dec)
+    reasons = np.full(len(ra), DRAWN, object)
+    reasons[:n] = _galaxy_faults(galaxies)
+    placed = np.isfinite(x) & np.isfinite(y) & np.isfinite(to_pixels).all(axis=(1, 2))
+    reasons[~placed] = NO_PLACE
+    if within is not None:
+        (ny, nx), reach = within
+        with np.errstate(invalid="ignore"):
+            near = (x > -reach) & (x < nx + reach) & (y > -reach) & (y < ny + reach)
+        reasons[placed & ~near & (reasons == DRAWN)] = OFF_IMAGE
+    kept = np.flatnonzero(reasons == DRAWN)
+    truth = _rows_of(truth, kept[kept < n], kept[kept >= n] - n)
+    parts = _components(truth, bandpass, exptime, to_pixels[kept], knot_smoothing)
+    # before the sum over components, which would hide what is not a number
+    flux, good = np.zeros(len(kept)), np.ones(len(kept), bool)
+    for part in parts:
+        own = part.photons.sum(axis=1)
+        flux[part.owner] += np.where(np.isfinite(own), own, 0)
+        good[part.owner] &= np.isfinite(own)
+    good &= flux < MOST_FLUX
+    reasons[kept[~good]] = BAD_FLUX
+    reasons[kept[good & ~(flux > 0)]] = NO_LIGHT
+    lit = np.flatnonzero(good & (flux > 0))
+    place = np.full(len(kept), -1)
+    place[lit] = np.arange(len(lit))
+    owner = np.concatenate([place[part.owner] for part in parts])
+    used = np.flatnonzero(owner >= 0)
+    order = used[np.argsort(owner[used], kind="stable")]
+    key = np.r_[truth.galaxies["galaxy_id"].to_numpy(np.int64), truth.stars["id"].to_numpy(np.int64)]
+    rows = kept[lit]
+    scene = Scene(
+        x=x[rows],
+        y=y[rows],
+        key=key.astype(np.uint64)[lit],
         owner=owner[order],
         kind=np.concatenate([np.full(len(part.owner), part.kind) for part in parts])[order],
         matrix=np.concatenate([part.matrix for part in parts])[order],
-        smoothing=np.concatenate([np.zeros((blank, 2, 2)), smoothing])[order],
-        knots=np.concatenate([np.zeros(blank, int), counts])[order],
-        photons=(np.concatenate([part.photons for part in parts]) * exptime)[order],
+        smoothing=np.concatenate([part.smoothing for part in parts])[order],
+        knots=np.concatenate([part.knots for part in parts])[order],
+        photons=np.concatenate([part.photons for part in parts])[order],
+    )
+    return Drawable(scene, rows, reasons, x, y)
+
+
+def _galaxy_faults(galaxies: pd.DataFrame) -> np.ndarray:
+    """Return why galaxies cannot be drawn; a size counts where its component has light."""
+    reasons = np.full(len(galaxies), DRAWN, object)
+    for component in COMPONENTS:
+        size = "bulge" if component == "bulge" else "disk"
+        lit = np.isfinite(galaxies[f"{component}_magnorm"].to_numpy(float))
+        for name in (f"size_{size}_true", f"size_minor_{size}_true", "position_angle_unlensed"):
+            values = galaxies[name].to_numpy(float)
+            good = np.isfinite(values) & ((values > 0) | (name == "position_angle_unlensed"))
+            reasons[lit & ~good] = BAD_SIZE
+    kappa, g1, g2 = (galaxies[name].to_numpy(float) for name in ("convergence", "shear_1", "shear_2"))
+    with np.errstate(invalid="ignore"):
+        reasons[~((kappa < 1) & (np.hypot(g1, g2) < 1 - kappa))] = BAD_LENSING
+    return reasons
+
+
+def _components(
+    truth: Truth, bandpass: Bandpass, exptime: float, to_pixels: np.ndarray, knot_smoothing: float
+) -> list[_Part]:
+    """Return the lit components of galaxies and stars; owners count galaxies before stars."""
+    n, m = len(truth.galaxies), len(truth.stars)
+    with np.errstate(over="ignore"):
+        light = star_photons(truth, bandpass) * exptime
+    points = np.zeros((m, 2, 2))
+    parts = [_Part(np.arange(n, n + m), POINT, points, points, np.zeros(m, int), light)]
+    kinds = {"bulge": DEVAUCOULEURS, "disk": EXPONENTIAL, "knots": KNOTS}
+    for component in COMPONENTS:
+        shape, lens = shape_matrices(truth.galaxies, component)
+        with np.errstate(over="ignore", invalid="ignore"):
+            photons = galaxy_photons(truth, bandpass, component) * exptime
+            rows = np.flatnonzero(~(photons.sum(axis=1) <= 0))
+        smoothing, counts = np.zeros((len(rows), 2, 2)), np.zeros(len(rows), int)
+        if component == "knots":
+            smoothing = (to_pixels[:n] @ lens)[rows] * knot_smoothing
+            counts = truth.galaxies["n_knots"].fillna(0).to_numpy(int)[rows]
+        matrix = (to_pixels[:n] @ lens @ shape)[rows]
+        parts.append(_Part(rows, kinds[component], matrix, smoothing, counts, photons[rows]))
+    return parts
+
+
+def _rows_of(truth: Truth, galaxies: np.ndarray, stars: np.ndarray) -> Truth:
+    """Return some galaxies and stars of a truth."""
+    return Truth(
+        truth.galaxies.iloc[galaxies],
+        truth.stars.iloc[stars],
+        {component: spectra.rows(galaxies) for component, spectra in truth.galaxy_spectra.items()},
+        truth.star_spectra.rows(stars),
+        truth.internal_frame,
     )
 
 
@@ -173,4 +280,6 @@ class _Part:
     owner: np.ndarray
     kind: int
     matrix: np.ndarray
+    smoothing: np.ndarray
+    knots: np.ndarray
     photons: np.ndarray

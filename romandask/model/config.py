@@ -94,11 +94,14 @@ class TruthSettings(Section):
 class RenderSettings(Section):
     """How light is drawn."""
 
+    engine: Literal["fourier", "galsim"] = Field(
+        "fourier", description="batched drawing in Fourier space, or GalSim object by object, a hundred times slower"
+    )
     n_waves: int = Field(5, ge=2, le=20, description="PSFs across a band between which the PSF is interpolated")
     truncation: float = Field(
         0.04, gt=0, description="surface brightness at a stamp's edge, in units of the sky noise of a pixel"
     )
-    largest: int = Field(1024, ge=64, description="largest stamp, pixels a side (a power of two)")
+    largest: int = Field(2048, ge=64, le=4096, description="largest stamp, pixels a side (a power of two)")
 
 
 class CoaddSettings(Section):

@@ -98,6 +98,10 @@ class LibrarySpectra:
     index: np.ndarray
     """(n,)"""
 
+    def rows(self, chosen: np.ndarray) -> LibrarySpectra:
+        """Return the spectra of some of the objects."""
+        return LibrarySpectra(self.library, self.index[chosen])
+
 
 @dataclass(frozen=True)
 class TophatSpectra:
@@ -112,6 +116,10 @@ class TophatSpectra:
     """(n, bins) L_nu, any unit; an object without light has zeros."""
     edges: np.ndarray
     """(bins + 1,) nm, rest frame."""
+
+    def rows(self, chosen: np.ndarray) -> TophatSpectra:
+        """Return the spectra of some of the objects."""
+        return TophatSpectra(self.values[chosen], self.edges)
 
 
 def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]], grid: np.ndarray) -> SpectrumLibrary:

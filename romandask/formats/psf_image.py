@@ -1,0 +1,31 @@
+"""PSF images in FITS: a unit star sampled finer than the pixels of its exposure, with what it belongs to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+
+def write(path: Path, image: np.ndarray, oversampling: int, pixel_scale: float, exposure: dict) -> None:
+    """Write one PSF image (side, side) to the first HDU.
+
+    Parameters
+    ----------
+    oversampling : samples along a native pixel
+    pixel_scale : arcsec between samples
+    exposure : visit, detector, band and mjd, by name
+    """
+    hdu = fits.PrimaryHDU(np.asarray(image, np.float32))
+    header = hdu.header
+    header["VISIT"] = (int(exposure["visit"]), "visit")
+    header["DETECTOR"] = (int(exposure["detector"]), "detector (Roman: SCA)")
+    header["FILTER"] = (str(exposure["band"]), "band")
+    header["MJD-OBS"] = (float(exposure["mjd"]), "start of the exposure, MJD")
+    header["OVERSAMP"] = (int(oversampling), "samples along a native pixel")
+    header["PIXSCALE"] = (float(pixel_scale), "arcsec between samples")
+    header["BUNIT"] = ("1/pixel", "share of a unit star's light in a native pixel")
+    header["CRPIX1"] = (image.shape[1] // 2 + 1, "sample on which the star is centred")
+    header["CRPIX2"] = (image.shape[0] // 2 + 1, "sample on which the star is centred")
+    hdu.writeto(path, overwrite=True, checksum=True)

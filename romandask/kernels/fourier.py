@@ -1,0 +1,268 @@
+"""Compiled sums of the renderer: transforms of objects at the frequencies of their stamps, folded to the pixel grid.
+
+The frequencies of a stamp that the PSF reaches lie one after another in flat arrays, row by row, so that the loops
+over them are vectorised: amplitudes of the PSF's modes, then the profile's transform, then phases and folding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import galsim
+import numba
+import numpy as np
+
+POINT, EXPONENTIAL, DEVAUCOULEURS, KNOTS = 0, 1, 2, 3
+EXPONENTIAL_RADIUS = 1 / 1.6783469900166605
+"""Scale length of an exponential disk over its half-light radius."""
+KNOT_SIGMA = 1 / np.sqrt(2 * np.log(2))
+"""Gaussian sigma over half-light radius."""
+_DISK = np.float32(EXPONENTIAL_RADIUS**2)
+_LEAST = np.float32(2.0**-20)
+_CELL_BITS, _OCTAVES = 7, 52
+"""The de Vaucouleurs table has 128 cells in each octave of k^2, found from the bits of a float32, from 2^-20 on."""
+_SHIFT = 23 - _CELL_BITS
+_FIRST_CELL = (127 - 20) << _CELL_BITS
+_CELLS = _OCTAVES << _CELL_BITS
+
+
+@dataclass(frozen=True)
+class Frequencies:
+    """Where a PSF has power, among the frequencies of one stamp size (column >= 0)."""
+
+    starts: np.ndarray
+    """(rows + 1,) where each row begins in the flat arrays; rows are j_y = -reach ..., columns j_x = 0 ..."""
+    x: np.ndarray
+    """(points,) float32, radians a pixel."""
+    y: np.ndarray
+    """(points,) float32"""
+    real: np.ndarray
+    """(modes, points) float32: the PSF's modes."""
+    imaginary: np.ndarray
+    """(modes, points) float32"""
+
+
+def frequencies(transforms: np.ndarray, seen: np.ndarray, stamp: int) -> Frequencies:
+    """Return the frequencies of a stamp of `stamp` pixels at which PSFs have power.
+
+    Parameters
+    ----------
+    transforms : (modes, rows, columns) complex, rows j_y = -rows / 2 ..., columns j_x = 0 ..., of 2 pi j / stamp
+    seen : (rows, columns) True where there is any power
+    """
+    # a row is kept to its last frequency with power; the negative Nyquist row has no partner
+    last = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
+    last[0] = 0
+    starts = np.concatenate([[0], np.cumsum(last)])
+    shape = (len(transforms), starts[-1])
+    x, y = np.empty(starts[-1], np.float32), np.empty(starts[-1], np.float32)
+    real, imaginary = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    step = 2 * np.pi / stamp
+    columns = (np.arange(seen.shape[1]) * step).astype(np.float32)
+    # row by row, for the largest stamps have tens of millions of frequencies
+    for row, count in enumerate(last):
+        part = slice(starts[row], starts[row + 1])
+        x[part] = columns[:count]
+        y[part] = (row - len(last) // 2) * step
+        real[:, part] = transforms[:, row, :count].real
+        imaginary[:, part] = transforms[:, row, :count].imag
+    return Frequencies(starts, x, y, real, imaginary)
+
+
+@lru_cache(maxsize=1)
+def devaucouleurs_table() -> np.ndarray:
+    """Return the transform of a de Vaucouleurs profile, half-light radius 1, at the first k^2 of each cell, float32."""
+    profile = galsim.DeVaucouleurs(half_light_radius=1.0)
+    cell = np.arange(_CELLS + 1)
+    squares = 2.0 ** (cell // (1 << _CELL_BITS) - 20) * (1 + (cell % (1 << _CELL_BITS)) / (1 << _CELL_BITS))
+    return np.array([profile.kValue(k, 0.0).real for k in np.sqrt(squares)], np.float32)
+
+
+@numba.njit(nogil=True, cache=True)
+def _hash(key, counter):
+    """splitmix64 of an identity and a counter, to (0, 1)."""
+    value = np.uint64(key) + np.uint64(counter) * np.uint64(0x9E3779B97F4A7C15)
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    value = value ^ (value >> np.uint64(31))
+    return (np.float64(value >> np.uint64(11)) + 0.5) / 9007199254740992.0
+
+
+@numba.njit(nogil=True, cache=True)
+def knot_offset(key, knot):
+    """Return the position of a knot in units of the half-light radius of a round Gaussian: the same in every image."""
+    first = _hash(key, 2 * knot + 1)
+    second = _hash(key, 2 * knot + 2)
+    radius = 0.8493218002880191 * np.sqrt(-2.0 * np.log(first))
+    return radius * np.cos(2 * np.pi * second), radius * np.sin(2 * np.pi * second)
+
+
+@numba.njit(nogil=True, cache=True)
+def _phases(angle, lowest, out):
+    """Write exp(-i angle j) for j = lowest, lowest + 1, ..."""
+    turn = np.cos(angle) - 1j * np.sin(angle)
+    value = np.cos(angle * lowest) - 1j * np.sin(angle * lowest)
+    for j in range(out.shape[0]):
+        out[j] = value
+        value *= turn
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _amplitudes(weights, real, imaginary, modes, re, im):
+    """Write the PSF: the sum of its first modes."""
+    for i in range(re.shape[0]):
+        re[i] = weights[0] * real[0, i]
+        im[i] = weights[0] * imaginary[0, i]
+    for m in range(1, modes):
+        for i in range(re.shape[0]):
+            re[i] += weights[m] * real[m, i]
+            im[i] += weights[m] * imaginary[m, i]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _squares(matrix, kx, ky, out):
+    """Write |M^T k|^2: the squared frequency in the frame in which the profile is round."""
+    xx = np.float32(matrix[0, 0] ** 2 + matrix[0, 1] ** 2)
+    yy = np.float32(matrix[1, 0] ** 2 + matrix[1, 1] ** 2)
+    xy = np.float32(2 * (matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1]))
+    for i in range(out.shape[0]):
+        out[i] = xx * kx[i] * kx[i] + xy * kx[i] * ky[i] + yy * ky[i] * ky[i]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _exponential(squares, re, im, total_re, total_im):
+    for i in range(squares.shape[0]):
+        t = np.float32(1) + _DISK * squares[i]
+        value = np.float32(1) / (t * np.sqrt(t))
+        total_re[i] += value * re[i]
+        total_im[i] += value * im[i]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _devaucouleurs(squares, table, re, im, total_re, total_im):
+    bits = squares.view(np.int32)
+    part = np.float32(1.0 / (1 << _SHIFT))
+    for i in range(squares.shape[0]):
+        squares[i] = max(squares[i], _LEAST)
+    for i in range(squares.shape[0]):
+        cell = min((bits[i] >> _SHIFT) - _FIRST_CELL, _CELLS - 1)
+        share = np.float32(bits[i] & ((1 << _SHIFT) - 1)) * part
+        value = table[cell] + share * (table[cell + 1] - table[cell])
+        total_re[i] += value * re[i]
+        total_im[i] += value * im[i]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, total_re, total_im):
+    """Add points at the places that an identity gives, each smoothed by a Gaussian, of equal light."""
+    xx = smoothing[0, 0] ** 2 + smoothing[0, 1] ** 2
+    yy = smoothing[1, 0] ** 2 + smoothing[1, 1] ** 2
+    xy = smoothing[0, 0] * smoothing[1, 0] + smoothing[0, 1] * smoothing[1, 1]
+    # least share of (k_y smoothing)^2 that any k_x leaves
+    least = yy - xy * xy / xx if xx > 0 else 0.0
+    columns = np.empty((count, reach + 1), np.complex128)
+    rows = np.empty((count, 2 * reach), np.complex128)
+    for k in range(count):
+        u, v = knot_offset(key, k)
+        _phases(step * (matrix[0, 0] * u + matrix[0, 1] * v), 0, columns[k])
+        _phases(step * (matrix[1, 0] * u + matrix[1, 1] * v), -reach, rows[k])
+    across_re = np.ascontiguousarray(columns.real).astype(np.float32)
+    across_im = np.ascontiguousarray(columns.imag).astype(np.float32)
+    sum_re, sum_im = np.empty(reach + 1, np.float32), np.empty(reach + 1, np.float32)
+    for j in range(2 * reach):
+        first, n = starts[j], starts[j + 1] - starts[j]
+        if n == 0 or least * (step * (j - reach)) ** 2 > 32.0:
+            continue
+        sum_re[:n] = 0
+        sum_im[:n] = 0
+        for k in range(count):
+            a, b = np.float32(rows[k, j].real / count), np.float32(rows[k, j].imag / count)
+            for i in range(n):
+                sum_re[i] += a * across_re[k, i] - b * across_im[k, i]
+                sum_im[i] += a * across_im[k, i] + b * across_re[k, i]
+        for i in range(n):
+            x, y = kx[first + i], ky[first + i]
+            value = np.float32(np.exp(-np.float32(0.5) * np.float32(xx * x * x + 2 * xy * x * y + yy * y * y)))
+            s, t = value * sum_re[i], value * sum_im[i]
+            total_re[first + i] += s * re[first + i] - t * im[first + i]
+            total_im[first + i] += s * im[first + i] + t * re[first + i]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=True)
+def _fold(total_re, total_im, starts, columns, rows, reach, out):
+    """Add phases and fold frequencies to those of the pixel grid: (size, size / 2 + 1)."""
+    size = out.shape[0]
+    half = size // 2
+    for j in range(2 * reach):
+        first, n = starts[j], starts[j + 1] - starts[j]
+        same = (j - reach) % size
+        mirrored = (size - same) % size
+        for low in range(0, n, half):
+            # of each half of a period the one is copied, the other is its mirror image; their ends belong to both
+            if (low // half) % 2 == 0:
+                for i in range(low, min(low + half + 1, n)):
+                    value = np.complex64(total_re[first + i] + 1j * total_im[first + i])
+                    out[same, i - low] += value * np.complex64(columns[i] * rows[j])
+            else:
+                for i in range(low, min(low + half + 1, n)):
+                    value = np.complex64(total_re[first + i] - 1j * total_im[first + i])
+                    out[mirrored, half - (i - low)] += value * np.complex64(np.conj(columns[i] * rows[j]))
+
+
+@numba.njit(nogil=True, cache=True)
+def fill(
+    out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, weights, modes,
+    starts, kx, ky, real, imaginary, reach, table,
+):  # fmt: skip
+    """Add the folded transforms of objects to `out` (stamps, size, size / 2 + 1); stamps begin at floor(x) - size / 2.
+
+    Parameters
+    ----------
+    chosen : (stamps,) numbers of the objects
+    first : (objects + 1,) number of the first component of each
+    weights : (components, modes of the PSF) float32
+    modes : (components,) how many of them are needed
+    """
+    size = out.shape[1]
+    step = 2 * np.pi / size
+    points = kx.shape[0]
+    re, im, squares = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, np.float32)
+    total_re, total_im = np.empty(points, np.float32), np.empty(points, np.float32)
+    columns, rows = np.empty(reach + 1, np.complex128), np.empty(2 * reach, np.complex128)
+    for s in range(chosen.shape[0]):
+        n = chosen[s]
+        total_re[:] = 0
+        total_im[:] = 0
+        for c in range(first[n], first[n + 1]):
+            _amplitudes(weights[c], real, imaginary, modes[c], re, im)
+            if kind[c] == POINT:
+                for i in range(points):
+                    total_re[i] += re[i]
+                    total_im[i] += im[i]
+            elif kind[c] == KNOTS:
+                _knots(
+                    keys[n], knots[c], matrix[c], smoothing[c], starts, kx, ky, step, reach, re, im, total_re, total_im
+                )
+            else:
+                _squares(matrix[c], kx, ky, squares)
+                if kind[c] == EXPONENTIAL:
+                    _exponential(squares, re, im, total_re, total_im)
+                else:
+                    _devaucouleurs(squares, table, re, im, total_re, total_im)
+        _phases(step * (x[n] - np.floor(x[n]) + size // 2), 0, columns)
+        _phases(step * (y[n] - np.floor(y[n]) + size // 2), -reach, rows)
+        _fold(total_re, total_im, starts, columns, rows, reach, out[s])
+
+
+@numba.njit(nogil=True, cache=True)
+def add(image, stamps, chosen, x, y):
+    """Add stamps (n, size, size) of objects to the image where they fall on it."""
+    ny, nx = image.shape
+    size = stamps.shape[1]
+    for s in range(chosen.shape[0]):
+        x0 = int(np.floor(x[chosen[s]])) - size // 2
+        y0 = int(np.floor(y[chosen[s]])) - size // 2
+        for j in range(max(0, -y0), min(size, ny - y0)):
+            for i in range(max(0, -x0), min(size, nx - x0)):
+                image[y0 + j, x0 + i] += stamps[s, j, i]

@@ -93,7 +93,7 @@ class RenderExposure:
         return {"image": image, "truth": expected, "dq": dq}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Profiles:
     """GalSim's PSFs of an exposure, one a node, on a coarse grid of places: what the second engine draws with."""
 

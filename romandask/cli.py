@@ -20,9 +20,10 @@ from rich.console import Console  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
-from romandask.export import export_obseq, export_psf, export_truth  # noqa: E402
+from romandask.export import export_meds, export_obseq, export_psf, export_truth  # noqa: E402
 from romandask.model.config import read_yaml  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
+from romandask.model.sky import Cone  # noqa: E402
 from romandask.pipeline import load_pipeline, pipeline_of  # noqa: E402
 from romandask.report import dag_svg, write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
@@ -236,6 +237,27 @@ def export_psf_images(
 ) -> None:
     """Write PSF images of Roman exposures (FITS): a unit star, 8 samples a pixel."""
     for path in export_psf(open_survey(store), out, exposure):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@export_app.command("meds")
+def export_meds_files(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    ids: Annotated[list[int] | None, typer.Option("--id", help="Id of an object; may be repeated.")] = None,
+    cone: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--cone", metavar="RA DEC RADIUS", help="All objects there: degrees, degrees, arcsec."),
+    ] = None,
+    band: Annotated[list[str] | None, typer.Option("--band", help="May be repeated; default: all.")] = None,
+    size: Annotated[int, typer.Option("--size", help="Pixels a side, even.")] = 48,
+    catalog: Annotated[str, typer.Option("--catalog", help="Whose objects: truth, roman or rubin.")] = "truth",
+) -> None:
+    """Write cutouts of objects from all Roman exposures that see them, with WCS and PSF: one MEDS file a band."""
+    if (ids is None) == (cone is None):
+        raise UserError("export meds needs --id (one or more) or --cone, not both")
+    of = Cone(*cone) if cone is not None else ids or []
+    for path in export_meds(open_survey(store), out, of, band or [], size, catalog):
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

@@ -6,9 +6,12 @@ import difflib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import xarray as xr
 
-from romandask.formats import obseq, psf_image, truth_files
+from romandask.cutouts import Wanted, located
+from romandask.formats import meds, obseq, psf_image, truth_files
 from romandask.model.errors import UserError
 from romandask.runtime.products import TableProduct
 from romandask.survey import Survey
@@ -81,6 +84,55 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
         psf_image.write(path, image, attributes["oversampling"], attributes["pixel_scale"], row)
         written.append(path)
     return written
+
+
+def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size: int, catalog: str) -> list[Path]:
+    """Write multi-epoch cutouts of objects from Roman's exposures, one MEDS file a band, and return where they are.
+
+    Images are in electrons, less the expected background; an object that no exposure of a band sees has no cutouts.
+
+    Raises
+    ------
+    UserError
+        If objects, bands or size are not what the survey has, or the folder cannot be written.
+    """
+    objects = located(of, survey.tables(catalog), catalog)
+    bands = bands or list(survey.instruments["roman"].bands)
+    layers = ("image", "background", "weight", "dq", "psf")
+    every = {band: survey.cutouts(objects, layers, (band,), size) for band in bands}
+    _prepare(folder)
+    table, names = survey.pointings("roman"), survey.exposure_product("roman").names
+    written = []
+    for band, found in every.items():
+        units, image = np.unique(found["unit"].to_numpy(), return_inverse=True)
+        exptime = table["exptime"].to_numpy()[[names.index(name) for name in units]]
+        zero = 2.5 * np.log10(survey.instruments["roman"].bandpass(band).ab_photons() * exptime)
+        derivatives = found["jacobian"].to_numpy()
+        columns = {name: found[name].to_numpy() for name in ("object", "column", "row")}
+        columns |= {name: found[f"{name}_image"].to_numpy() for name in ("x", "y")}
+        for k, name in enumerate(("dudx", "dudy", "dvdx", "dvdy")):
+            columns[name] = derivatives[:, k // 2, k % 2]
+        catalogue = meds.Catalog(
+            objects,
+            pd.DataFrame(columns | {"image": image}),
+            pd.DataFrame({"name": units, "magzp": zero}),
+            size,
+        )
+        path = folder / f"meds-{band}.fits"
+        meds.write(path, catalogue, _blocks(found))
+        written.append(path)
+    return written
+
+
+def _blocks(found: xr.Dataset) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """Yield the planes of the cutouts of one exposure after another."""
+    stop = 0
+    for count in found["image"].chunks[0] if found.sizes["cutout"] else ():
+        rows, stop = slice(stop, stop + count), stop + count
+        part = found.isel(cutout=rows).load()
+        planes = {name: part[name].to_numpy() for name in ("weight", "dq", "psf")}
+        # beyond an image's edge both are 0
+        yield rows, planes | {"image": (part["image"] - part["background"]).to_numpy()}
 
 
 def _parts(product: TableProduct) -> Iterator[pd.DataFrame]:

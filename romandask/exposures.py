@@ -136,7 +136,9 @@ def exposures(
 
     def unit(row: int) -> Unit:
         inputs = truth.inputs(*cone(corners[row]))
-        return Unit(names[row], {**common, "row": row, **vars(every[row])}, inputs)
+        # PSFs are those of a detector and band
+        kin = f"{every[row].band}-{every[row].detector}"
+        return Unit(names[row], {**common, "row": row, **vars(every[row])}, inputs, kin=kin)
 
     axes = ("exposure",)
 

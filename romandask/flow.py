@@ -269,7 +269,7 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
             kept += 1
             continue
         store.record(product.stage, unit.name).unlink(missing_ok=True)
-        tasks.append(Task(index, inputs, unit.cost))
+        tasks.append(Task(index, inputs, unit.cost, unit.kin))
     return tasks, kept, blocked
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import dask.dataframe as dd
 import numpy as np
@@ -13,6 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from romandask.coadds import coadds
+from romandask.cutouts import Positions, Wanted, cutouts, located
 from romandask.detections import detections, objects
 from romandask.exposures import exposures
 from romandask.incoming import incoming, open_sources
@@ -81,6 +82,45 @@ class Survey:
     def psfs(self, survey: str) -> xr.Dataset:
         """Return lazy PSF images (exposure, v, u): a unit star of flat f_nu, sampled 8 times finer than pixels."""
         return self.psf_product(survey).dataset
+
+    def cutouts(
+        self,
+        of: Wanted,
+        layers: Sequence[str] = ("image",),
+        bands: Sequence[str] | None = None,
+        size: int = 48,
+        survey: str = "roman",
+        images: Literal["exposures", "coadds"] = "exposures",
+        catalog: str = "truth",
+    ) -> xr.Dataset:
+        """Return lazy cutouts (cutout, y, x) around objects, of every image that sees them, with their coordinates.
+
+        Parameters
+        ----------
+        of : ids of objects; or a region or cone, for all objects in it; or a table with columns id, ra, dec
+        layers : image, truth, dq, background, weight, psf of exposures; image, weight, noise, nimages of coadds
+        bands : None for all
+        size : pixels a side, even
+        catalog : whose objects: truth (galaxies and stars), or an instrument's object table
+
+        Raises
+        ------
+        UserError
+            If an id is not in the catalog, or a name is not one of the above.
+        """
+        found = located(of, self.tables(catalog), catalog)
+        kinds = {"exposures": self.exposure_product, "coadds": self.coadd_product}
+        product = self._one(kinds, images, tuple(kinds))(survey)
+        return cutouts(product, found, tuple(layers), None if bands is None else tuple(bands), size)
+
+    def tables(self, catalog: str) -> tuple[Positions, ...]:
+        """Return the tables that hold the objects of a catalog: truth, or an instrument's."""
+        if catalog == "truth":
+            truth = self.truth_catalogs
+            return Positions(truth.galaxies, "galaxy_id", "ra", "dec"), Positions(truth.stars, "id", "ra", "dec")
+        if catalog not in self.instruments:
+            raise UserError(f"catalog {catalog!r}: this survey has truth, {', '.join(self.instruments)}")
+        return (Positions(self.object_product(catalog), "objectId", "coord_ra", "coord_dec"),)
 
     def coadds(self, survey: str) -> xr.Dataset:
         """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, psf; coords tile, band, header ..."""

@@ -42,7 +42,7 @@ def test_an_image_off_the_middle_is_that_of_its_place(small):
 
 
 def test_without_variation_an_image_is_that_of_the_middle(small):
-    roman = replace(small.roman, settings=RomanSettings(bands=("H158",), psf_variation=False))
+    roman = replace(small.roman, settings=RomanSettings(bands=("H158",), psf_degree=0))
     middle = (galsim.roman.n_pix - 1) / 2
     images = [psf_image(roman, small.exposures[0], place, place) for place in (300.0, middle)]
     np.testing.assert_array_equal(*images)

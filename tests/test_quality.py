@@ -17,7 +17,7 @@ LAYERS = [
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
-    {"matches", "detections"},
+    {"matches", "detections", "cutouts"},
     {"coadds"},
     {"truth_index", "psfs"},
     {"exposures"},

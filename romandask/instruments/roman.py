@@ -22,7 +22,8 @@ from romandask.instruments.roman_sun import FURTHEST, NEAREST, sun_angle
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import (
-    CORE_MODES,
+    CORE,
+    FAINTEST,
     BrightPsf,
     Grid,
     PsfModel,
@@ -59,7 +60,12 @@ class RomanSettings(Section):
     bands: tuple[Literal["Y106", "J129", "H158", "F184"], ...] = ("Y106", "J129", "H158", "F184")
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple"] = "simple"
-    psf_variation: bool = Field(True, description="the PSF varies over each SCA; false: that of its middle everywhere")
+    psf_degree: int = Field(
+        5,
+        ge=0,
+        le=8,
+        description="degree of the polynomials by which PSFs vary over an SCA; 0: that of its middle",
+    )
     bright_stars: dict[float, Literal[1, 2, 4]] = Field(
         {15.0: 4, 12.0: 2},
         description="stars brighter than each magnitude: pupil pixels binned for their PSF (8 for all else)",
@@ -125,13 +131,13 @@ class Roman:
     def psf(self, exposure: Exposure) -> PsfModel:
         """Return the PSF of an SCA and band, as it varies over the SCA."""
         settings = self.settings
-        return _psf(exposure.detector, exposure.band, self.n_waves, settings.psf_variation, settings.charge_diffusion)
+        return _psf(exposure.detector, exposure.band, self.n_waves, settings.psf_degree, settings.charge_diffusion)
 
     def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
-        """Return the PSF at one place of the SCA, on stamps of up to the core's size."""
-        if not self.settings.psf_variation:
+        """Return the PSF at one place of the SCA, on stamps of up to 256 pixels."""
+        if not self.settings.psf_degree:
             x, y = _MIDDLE.x - 0.5, _MIDDLE.y - 0.5
-        grid, diffusion = Grid(CORE_MODES, FOLDS[exposure.band]), self.settings.charge_diffusion
+        grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.settings.charge_diffusion
         profiles = self.profiles(exposure, x, y)
         return model(np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles]), grid)
 
@@ -187,10 +193,12 @@ def _date(mjd: float):
 roman_psfs._make_aperture.resize(1)
 
 
-FOLDS = {"Y106": 3, "J129": 2, "H158": 2, "F184": 2}
+FOLDS = {"Y106": 3, "J129": 3, "H158": 2, "F184": 2}
 """How many times the pixels' Nyquist frequency the optics reach in each band."""
 _EXTENT = 4096
 """Pixels, a side, that a PSF of the unbinned pupil covers; one of a binned pupil covers so many times less."""
+_NEAR = 256
+"""Pixels, a side, that the PSF of one place covers."""
 _MIDDLE = galsim.PositionD(SIDE / 2, SIDE / 2)
 
 
@@ -206,28 +214,26 @@ def _edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, flo
 
 
 @lru_cache(maxsize=1)
-def _psf(sca: int, band: str, n_waves: int, varies: bool, diffusion: float) -> PsfModel:
+def _psf(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     waves = roman_bandpass(band, n_waves).nodes
     scale = galsim.roman.pixel_scale
-    grid = Grid(_EXTENT // 8, FOLDS[band])
-    core = Grid(CORE_MODES, FOLDS[band])
-    varied = tuple(sorted({0, n_waves // 2, n_waves - 1})) if varies else ()
+    grid, core = Grid(_EXTENT // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
+    places = place_grid((SIDE, SIDE), degree) if degree else np.empty((0, 2))
     nodes = np.empty((n_waves, *grid.shape), np.complex64)
-    differences = np.empty((len(varied), 8, *core.shape), np.complex64)
+    differences = np.empty((n_waves, len(places), *core.shape), np.complex64)
     # by wavelength, for GalSim keeps the pupil of one
     for node, wave in enumerate(waves):
         nodes[node] = sample(_optics(sca, band, wave, 8), scale, grid, diffusion)
-        if node in varied:
-            middle = grid.within(nodes[node : node + 1], core.size)[0]
-            for place, (x, y) in enumerate(place_grid((SIDE, SIDE))):
-                there = _optics(sca, band, wave, 8, galsim.PositionD(x + 0.5, y + 0.5))
-                differences[varied.index(node), place] = sample(there, scale, core, diffusion) - middle
-    return model(nodes, grid, Variation((SIDE, SIDE), varied, differences) if varies else None)
+        middle = grid.within(nodes[node : node + 1], core.size)[0]
+        for place, (x, y) in enumerate(places):
+            there = _optics(sca, band, wave, 8, galsim.PositionD(x + 0.5, y + 0.5))
+            differences[node, place] = sample(there, scale, core, diffusion) - middle
+    return model(nodes, grid, Variation((SIDE, SIDE), degree, differences) if degree else None)
 
 
 @dataclass(frozen=True)
 class _WideNodes:
-    """Samples, one after another, the PSFs of a finer pupil."""
+    """The PSFs of a finer pupil, one after another."""
 
     sca: int
     band: str
@@ -238,6 +244,19 @@ class _WideNodes:
     diffusion: float
 
     def __call__(self) -> Iterator[np.ndarray]:
-        for wave in self.waves:
-            profile = _optics(self.sca, self.band, wave, self.pupil_bin)
-            yield sample(profile, galsim.roman.pixel_scale, self.grid, self.diffusion)
+        for lit, values in _wide_samples(self):
+            transform = np.zeros(self.grid.shape, np.complex64)
+            transform[np.unpackbits(lit, count=transform.size).view(bool).reshape(transform.shape)] = values
+            yield transform
+
+
+@lru_cache(maxsize=2)
+def _wide_samples(nodes: _WideNodes) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return, a node, the bits of the frequencies at which it has power, and its values there: sampling takes long."""
+    found = []
+    for wave in nodes.waves:
+        profile = _optics(nodes.sca, nodes.band, wave, nodes.pupil_bin)
+        transform = sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion)
+        lit = np.abs(transform) > FAINTEST
+        found.append((np.packbits(lit), transform[lit]))
+    return found

@@ -19,6 +19,15 @@ EXPONENTIAL_RADIUS = 1 / 1.6783469900166605
 KNOT_SIGMA = 1 / np.sqrt(2 * np.log(2))
 """Gaussian sigma over half-light radius."""
 _DISK = np.float32(EXPONENTIAL_RADIUS**2)
+_DECAY = 1.6783469900166605
+"""Of an exponential disk: exp(-1.678 r) at r half-light radii."""
+_WINGS = 7.669249442500805
+"""Of a de Vaucouleurs profile: exp(-7.669 r^(1/4))."""
+_PEAK = 5040 * 4 * 2 * np.pi / _WINGS**8
+"""Light of a de Vaucouleurs profile that is 1 in its centre, half-light radius 1: 8 pi Gamma(8) / b^8."""
+_FAR_DISK, _FAR_BULGE = 6.5, 70.0
+"""Half-light radii beyond which less than 2e-4 of the light lies."""
+_KNOTS_A_SIDE = 9
 _LEAST = np.float32(2.0**-20)
 _CELL_BITS, _OCTAVES = 7, 52
 """The de Vaucouleurs table has 128 cells in each octave of k^2, found from the bits of a float32, from 2^-20 on."""
@@ -41,6 +50,11 @@ class Frequencies:
     """(modes, points) float32: the PSF's modes."""
     imaginary: np.ndarray
     """(modes, points) float32"""
+
+    @property
+    def totals(self) -> np.ndarray:
+        """(modes,) their values at zero frequency: the light on the stamp."""
+        return self.real[:, self.starts[(len(self.starts) - 1) // 2]]
 
 
 def frequencies(transforms: np.ndarray, seen: np.ndarray, stamp: int) -> Frequencies:
@@ -253,6 +267,82 @@ def fill(
         _phases(step * (x[n] - np.floor(x[n]) + size // 2), 0, columns)
         _phases(step * (y[n] - np.floor(y[n]) + size // 2), -reach, rows)
         _fold(total_re, total_im, starts, columns, rows, reach, out[s])
+
+
+@numba.njit(nogil=True, cache=True)
+def _wing(kind, xx, xy, yy, dx, dy):
+    """Return a profile of light 1, |det M| = 1, at an offset of its centre; M M^T inverted is [[xx, xy], [xy, yy]]."""
+    radius = np.sqrt(max(xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy, 0.0))
+    if kind == EXPONENTIAL:
+        return _DECAY * _DECAY / (2 * np.pi) * np.exp(-_DECAY * radius)
+    return np.exp(-_WINGS * np.sqrt(np.sqrt(radius))) / _PEAK
+
+
+@numba.njit(nogil=True, cache=True)
+def unfold(stamps, chosen, x, y, first, kind, matrix, light):
+    """Subtract from stamps (n, size, size) the light of galaxies from beyond their edges.
+
+    A transform sampled at a stamp's frequencies is that of a profile repeated with the stamp's period. The light of the
+    repetitions is smooth there, far in their wings: it is found on a coarse grid and interpolated linearly.
+
+    Parameters
+    ----------
+    light : (components,) as their PSF has it on the stamp
+    """
+    size = stamps.shape[1]
+    n = _KNOTS_A_SIDE
+    step = (size - 1) / (n - 1)
+    coarse = np.empty((n, n))
+    for s in range(chosen.shape[0]):
+        o = chosen[s]
+        x0, y0 = x[o] - np.floor(x[o]) + size // 2, y[o] - np.floor(y[o]) + size // 2
+        coarse[:] = 0
+        any_light = False
+        for c in range(first[o], first[o + 1]):
+            if kind[c] != EXPONENTIAL and kind[c] != DEVAUCOULEURS:
+                continue
+            m = matrix[c]
+            xx, yy = m[0, 0] ** 2 + m[0, 1] ** 2, m[1, 0] ** 2 + m[1, 1] ** 2
+            xy = m[0, 0] * m[1, 0] + m[0, 1] * m[1, 1]
+            area = np.sqrt(max(xx * yy - xy * xy, 1e-30))
+            largest = np.sqrt((xx + yy + np.sqrt((xx - yy) ** 2 + 4 * xy * xy)) / 2)
+            far = _FAR_DISK if kind[c] == EXPONENTIAL else _FAR_BULGE
+            if size / 2 > far * largest or light[c] == 0:
+                continue
+            any_light = True
+            ixx, ixy, iyy = yy / area**2, -xy / area**2, xx / area**2
+            scale = light[c] / area
+            outer = 0.0
+            for j in range(-2, 3):
+                for i in range(-2, 3):
+                    if abs(i) == 2 or abs(j) == 2:
+                        outer += _wing(kind[c], ixx, ixy, iyy, i * size, j * size)
+            for b in range(n):
+                for a in range(n):
+                    total = outer
+                    for j in range(-1, 2):
+                        for i in range(-1, 2):
+                            if i != 0 or j != 0:
+                                dx, dy = a * step - x0 + i * size, b * step - y0 + j * size
+                                total += _wing(kind[c], ixx, ixy, iyy, dx, dy)
+                    coarse[b, a] += scale * total
+        if any_light:
+            _subtract(stamps[s], coarse, step)
+
+
+@numba.njit(nogil=True, cache=True)
+def _subtract(stamp, coarse, step):
+    """Subtract what a coarse grid with a step has between its points, linearly."""
+    size, n = stamp.shape[0], coarse.shape[0]
+    for j in range(size):
+        b = min(int(j / step), n - 2)
+        up = j / step - b
+        for i in range(size):
+            a = min(int(i / step), n - 2)
+            across = i / step - a
+            low = coarse[b, a] + across * (coarse[b, a + 1] - coarse[b, a])
+            high = coarse[b + 1, a] + across * (coarse[b + 1, a + 1] - coarse[b + 1, a])
+            stamp[j, i] -= low + up * (high - low)
 
 
 @numba.njit(nogil=True, cache=True)

@@ -63,12 +63,12 @@ def object_profile(scene: Scene, n: int, first: np.ndarray, psfs: list[galsim.GS
         if scene.photons[c].sum() <= LEAST_SHARE * total:
             continue
         psf = galsim.Sum([one * flux for one, flux in zip(psfs, scene.photons[c], strict=True)])
-        source = _source(scene, n, c)
+        source = component_profile(scene, n, c)
         parts.append(psf if source is None else galsim.Convolve(source, psf))
     return galsim.Sum(parts)
 
 
-def _source(scene: Scene, n: int, c: int) -> galsim.GSObject | None:
+def component_profile(scene: Scene, n: int, c: int) -> galsim.GSObject | None:
     """Return the profile of one component, of unit flux, in pixels; None for a point."""
     matrix = scene.matrix[c]
     if scene.kind[c] == EXPONENTIAL:

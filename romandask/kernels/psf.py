@@ -8,13 +8,16 @@ from functools import cached_property, lru_cache
 
 import galsim
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from scipy import fft
 
 from romandask.kernels.fourier import Frequencies, frequencies
 
 _NEGLIGIBLE = 1e-7
 """Surface brightness of a unit star, 1/pixel, below which a mode of the PSF's variation is left out."""
-CORE_MODES = 256
+FAINTEST = 1e-7
+"""Share of a transform's largest value below which it is taken for empty."""
+CORE = 128
 """Largest stamp, pixels, on which the variation over the detector is followed."""
 
 
@@ -49,16 +52,16 @@ class Grid:
 
 @dataclass(frozen=True)
 class Variation:
-    """How the PSF differs from that in the middle of the detector, on a grid of 3 x 3 places, at some of the nodes.
+    """How the PSF at each node differs from that in the middle of the detector, at the places of `place_grid`.
 
-    Between the places it is a parabola along each axis, between the nodes one in wavelength (a line for two).
+    Between the places it is the polynomial of their degree through all of them.
     """
 
     shape: tuple[int, int]
     """Detector (ny, nx)."""
-    nodes: tuple[int, ...]
+    degree: int
     differences: np.ndarray
-    """(nodes, 8, rows, columns) complex64 on the grid of the core: places in rows, the middle one left out."""
+    """(nodes, places, rows, columns) complex64 on the grid of the core."""
 
 
 @dataclass(frozen=True)
@@ -86,33 +89,40 @@ class PsfModel:
     modes: np.ndarray
     """(modes, *core.shape) complex64: the first has the light, the others none."""
     mixing: np.ndarray
-    """(nodes + 8 * varied, modes): each sampled PSF, or difference from that in the middle, as a sum of modes."""
+    """(nodes * (1 + places), modes): each sampled PSF, or difference from that in the middle, as a sum of modes."""
     peaks: np.ndarray
     """(modes,) largest surface brightness, 1/pixel, of each."""
-    varied: tuple[int, ...] = ()
-    """Nodes at which the variation was sampled."""
+    degree: int = 0
+    """Of the polynomials in place; 0 for a PSF that is the same everywhere."""
     shape: tuple[int, int] = (1, 1)
     """Detector (ny, nx)."""
 
     def weights(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the modes' weights (n, modes), float32, of light (n, nodes) at places on the detector."""
         parts = [photons]
-        if self.varied:
-            light = photons @ lagrange(np.arange(photons.shape[1]), np.array(self.varied, float)).astype(photons.dtype)
-            places = places_of(x, y, self.shape)
-            parts.append((light[:, :, None] * places[:, None, :]).reshape(len(photons), -1))
+        if self.degree:
+            places = place_weights(x, y, self.shape, self.degree).astype(photons.dtype)
+            width = photons.shape[1] * places.shape[1]
+            parts.append((photons[:, :, None] * places[:, None, :]).reshape(len(photons), width))
         return (np.concatenate(parts, axis=1) @ self.mixing).astype(np.float32)
 
-    def at(self, node: int, x: float, y: float) -> np.ndarray:
-        """Return the transform (core.shape) of the PSF of one node at a place."""
-        light = np.zeros((1, len(self.nodes)))
-        light[0, node] = 1.0
-        return np.tensordot(self.weights(light, np.array([x]), np.array([y]))[0], self.modes, 1)
+    def shifted(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return, as `weights`, only what the PSF at places differs by from that in the middle."""
+        return self.weights(photons, x, y) - (photons @ self.mixing[: photons.shape[1]]).astype(np.float32)
 
     @lru_cache(maxsize=16)  # noqa: B019 - a model lives as long as its detector is drawn
     def frequencies(self, stamp: int) -> Frequencies:
         """Return the modes at the frequencies of a stamp of at most core.size pixels."""
         return stamp_frequencies(self.modes, self._images, self.core, stamp)
+
+    @lru_cache(maxsize=4)  # noqa: B019
+    def wide_frequencies(self, stamp: int) -> Frequencies:
+        """Return the PSFs of the nodes in the middle of the detector at the frequencies of a larger stamp."""
+        fine = np.empty((len(self.nodes), 0, 0), np.float32)
+        # a stamp as large as the grid needs no image to cut
+        if stamp < self.grid.size:
+            fine = np.stack([star_image(node, self.grid, self.grid.folds) for node in self.nodes])
+        return stamp_frequencies(self.nodes, fine, self.grid, stamp)
 
     @cached_property
     def _images(self) -> np.ndarray:
@@ -137,13 +147,15 @@ def stamp_frequencies(transforms: np.ndarray, images: np.ndarray, grid: Grid, st
     """
     stride = grid.size // stamp
     power = np.abs(transforms[:, ::stride, ::stride]).max(axis=0)
-    seen = power > 1e-7 * power.max()
+    seen = power > FAINTEST * power.max()
     if stride == 1:
         return frequencies(transforms, seen, stamp)
-    middle, half = images.shape[1] // 2, grid.folds * stamp // 2
-    part = images[:, middle - half : middle + half, middle - half : middle + half]
-    cut = fft.rfft2(fft.ifftshift(part, axes=(1, 2))) / grid.folds**2
-    return frequencies(fft.fftshift(cut, axes=1), seen, stamp)
+    return frequencies(np.stack([_cut(image, grid.folds, stamp) for image in images]), seen, stamp)
+
+
+def _cut(image: np.ndarray, folds: int, size: int) -> np.ndarray:
+    """Return the transform, on the grid of `size` pixels, of the middle of an image that is finer by `folds`."""
+    return np.fft.fftshift(fft.rfft2(fft.ifftshift(_middle(image, folds * size))) / folds**2, axes=0)
 
 
 def edge_brightness(transforms: np.ndarray, grid: Grid) -> dict[int, float]:
@@ -185,44 +197,63 @@ def fine_image(psf: PsfModel, shares: np.ndarray, x: float, y: float, side: int,
     side : native pixels that the image covers
     oversampling : samples along a pixel; the star is centred on sample side * oversampling / 2
     """
-    weights = psf.weights(np.asarray(shares, float)[None], np.array([x]), np.array([y]))[0]
-    transform = np.tensordot(weights, psf.modes, 1)
-    rows, columns = psf.core.shape
+    shares = np.asarray(shares, float)
+    image = _finer(np.tensordot(shares.astype(np.float32), psf.nodes, 1), psf.grid, oversampling)
+    image = _middle(image, side * oversampling)
+    if psf.degree:
+        weights = psf.shifted(shares[None], np.array([x]), np.array([y]))[0]
+        change = _finer(np.tensordot(weights, psf.modes, 1), psf.core, oversampling)
+        inside = _middle(change, min(len(change), len(image)))
+        low = (len(image) - len(inside)) // 2
+        image[low : low + len(inside), low : low + len(inside)] += inside
+    return image
+
+
+def _finer(transform: np.ndarray, grid: Grid, oversampling: int) -> np.ndarray:
+    """Return the image (grid.size * oversampling, square) of a transform, centred on the sample in the middle."""
+    rows, columns = grid.shape
     # frequencies beyond the optics' reach are empty: padded with zeros they make finer samples
-    fine = max(rows, psf.core.size * oversampling)
+    fine = np.lcm(rows, grid.size * oversampling)
     padded = np.zeros((fine, fine // 2 + 1), np.complex64)
     padded[fine // 2 - rows // 2 : fine // 2 + rows // 2, :columns] = transform
-    image = fft.fftshift(fft.irfft2(np.fft.ifftshift(padded, axes=0), s=(fine, fine))) * (fine / psf.core.size) ** 2
-    step = fine // (psf.core.size * oversampling)
-    image = image[::step, ::step]
-    middle, half = image.shape[0] // 2, side * oversampling // 2
-    return image[middle - half : middle + half, middle - half : middle + half]
+    image = fft.fftshift(fft.irfft2(np.fft.ifftshift(padded, axes=0), s=(fine, fine))) * (fine / grid.size) ** 2
+    step = fine // (grid.size * oversampling)
+    return image[::step, ::step]
 
 
-def lagrange(at: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return the weights (n, k) of the values at k nodes, of the polynomial through all of them, at n places."""
-    weights = np.ones((len(at), len(nodes)))
-    for k, node in enumerate(nodes):
-        for other in np.delete(nodes, k):
-            weights[:, k] *= (at - other) / (node - other)
-    return weights
+def _middle(image: np.ndarray, side: int) -> np.ndarray:
+    """Return the middle of an image that is centred on the sample in its middle, the same way."""
+    low = image.shape[0] // 2 - side // 2
+    return image[low : low + side, low : low + side].copy()
 
 
-def places_of(x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the weights (n, 8) of the places around the middle; an object off the detector is as at its edge."""
-    nodes = np.array([0.0, 0.5, 1.0])
+def place_grid(shape: tuple[int, int], degree: int) -> np.ndarray:
+    """Return the places (n, 2), x and y, 0 at the centre of the first pixel, at which the variation is sampled.
+
+    They are the Padua points, (degree + 1) (degree + 2) / 2 of them, through which polynomials of that total degree in
+    the plane are interpolated best (Caliari, De Marchi & Vianello 2005).
+    """
+    points = [
+        (np.cos(j * np.pi / degree), np.cos(k * np.pi / (degree + 1)))
+        for j in range(degree + 1)
+        for k in range(degree + 2)
+        if (j + k) % 2 == 0
+    ]
+    return (np.array(points) + 1) / 2 * shape[::-1] - 0.5
+
+
+def place_weights(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: int) -> np.ndarray:
+    """Return the weights (n, places) of the places of `place_grid`; an object off the detector is as at its edge."""
+    known = _polynomials(*place_grid(shape, degree).T, shape, degree)
+    return _polynomials(np.asarray(x, float), np.asarray(y, float), shape, degree) @ np.linalg.inv(known)
+
+
+def _polynomials(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: int) -> np.ndarray:
     across, up = (
-        lagrange(np.clip((np.asarray(value) + 0.5) / side, 0, 1), nodes)
+        chebvander(np.clip(2 * (value + 0.5) / side - 1, -1, 1), degree)
         for value, side in zip((x, y), shape[::-1], strict=True)
     )
-    return np.delete((up[:, :, None] * across[:, None, :]).reshape(-1, 9), 4, axis=1)
-
-
-def place_grid(shape: tuple[int, int]) -> list[tuple[float, float]]:
-    """Return the eight places (x, y), 0 at the centre of the first pixel, at which the variation is sampled."""
-    ny, nx = shape
-    every = [(i * nx / 2 - 0.5, j * ny / 2 - 0.5) for j in range(3) for i in range(3)]
-    return every[:4] + every[5:]
+    return np.stack([across[:, i] * up[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
 
 
 def sample(profile: galsim.GSObject, pixel_scale: float, grid: Grid, diffusion: float = 0.0) -> np.ndarray:
@@ -288,8 +319,13 @@ def radial_model(
 
 def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> PsfModel:
     """Return the model of sampled PSFs: their mean and the principal modes of what they differ by."""
-    core = Grid(min(grid.size, CORE_MODES), grid.folds)
+    core = Grid(min(grid.size, CORE), grid.folds)
     centre = grid.within(nodes, core.size)
+    if core.size < grid.size:
+        # the light beyond the core's edges would be folded into it
+        power = np.abs(centre).max(axis=0)
+        seen = power > FAINTEST * power.max()
+        centre = np.stack([_cut(star_image(node, grid, grid.folds), grid.folds, core.size) * seen for node in nodes])
     mean = centre.mean(axis=0)
     rest = (centre - mean).reshape(len(nodes), -1)
     if variation is not None:
@@ -313,6 +349,6 @@ def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> 
         np.concatenate([mean[None], modes[kept]]).astype(np.complex64),
         np.concatenate([light, mixing], axis=1).astype(np.float32),
         np.concatenate([[np.abs(star_image(mean, core, core.folds)).max()], peaks[kept]]),
-        variation.nodes if variation is not None else (),
+        variation.degree if variation is not None else 0,
         variation.shape if variation is not None else (1, 1),
     )  # fmt: skip

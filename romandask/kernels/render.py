@@ -24,13 +24,16 @@ from romandask.kernels.fourier import (
     add,
     devaucouleurs_table,
     fill,
+    unfold,
 )
 from romandask.kernels.psf import BrightPsf, Grid, PsfModel, stamp_frequencies, star_image
 
-SMALLEST = 16
+SMALLEST = 32
 """Smallest stamp, pixels a side."""
 _BATCH_BYTES = 1 << 24
-_PRECISION = 0.2
+_MEASURED = 1000
+"""Of `faintest`: objects with more light are drawn on stamps that hold all but a thousandth of a disk."""
+_PRECISION = 0.1
 """Modes of the PSF are left out where together they change no pixel by more than this share of `faintest`."""
 
 
@@ -92,7 +95,7 @@ def draw(
     image = np.zeros(shape, np.float32)
     wide = (stamps.size > psf.core.size) | ((stamps.bright >= 0) & (stamps.size > 0))
     _draw_core(image, scene, psf, stamps.size, wide, faintest)
-    draw_wide(image, scene, scene.photons, psf.nodes, psf.grid, np.where(wide & (stamps.bright < 0), stamps.size, 0))
+    _draw_middle(image, scene, psf, np.where(wide & (stamps.bright < 0), stamps.size, 0))
     for number, star in enumerate(bright):
         own = stamps.bright == number
         if stamps.size[own].any():
@@ -137,21 +140,31 @@ def _draw_core(
     """Add objects to an image, each with the PSF of its place.
 
     Of `wide` objects only the difference from the PSF in the middle of the detector is drawn here, on a stamp of the
-    model's core, for `draw_wide` to add the rest.
+    model's core, for others to add the rest.
     """
     x, y = scene.x[scene.owner], scene.y[scene.owner]
     photons = scene.photons.astype(np.float32)
     weights = psf.weights(photons, x, y)
     far = wide[scene.owner]
-    weights[far] -= photons[far] @ psf.mixing[: photons.shape[1]]
+    weights[far] = psf.shifted(photons[far], x[far], y[far])
     modes = _needed(weights, psf.peaks, faintest * _PRECISION)
     first = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
     core = np.minimum(size, psf.core.size)
-    if not psf.varied:
+    if not psf.degree:
         core = np.where(wide, 0, core)
     for stamp in np.unique(core[core > 0]):
         waves = psf.frequencies(int(stamp))
         _draw(image, scene, np.flatnonzero(core == stamp), first, weights, modes, waves, int(stamp), psf.grid.folds)
+
+
+def _draw_middle(image: np.ndarray, scene: Scene, psf: PsfModel, size: np.ndarray) -> None:
+    """Add objects on stamps larger than the model's core, with the PSF in the middle of the detector."""
+    first = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
+    weights = scene.photons.astype(np.float32)
+    every = np.full(len(scene.owner), weights.shape[1])
+    for stamp in np.unique(size[size > 0]):
+        waves = psf.wide_frequencies(int(stamp))
+        _draw(image, scene, np.flatnonzero(size == stamp), first, weights, every, waves, int(stamp), psf.grid.folds)
 
 
 def draw_wide(
@@ -199,6 +212,7 @@ def _draw(
     folds: int,
 ) -> None:
     batch = max(1, _BATCH_BYTES // (stamp * stamp * 8))
+    light = weights @ waves.totals[: weights.shape[1]]
     for start in range(0, len(chosen), batch):
         rows = chosen[start : start + batch]
         transforms = np.zeros((len(rows), stamp, stamp // 2 + 1), np.complex64)
@@ -207,7 +221,9 @@ def _draw(
             scene.knots, weights, modes, waves.starts, waves.x, waves.y, waves.real, waves.imaginary,
             folds * stamp // 2, devaucouleurs_table(),
         )  # fmt: skip
-        add(image, fft.irfft2(transforms, s=(stamp, stamp), overwrite_x=True), rows, scene.x, scene.y)
+        images = fft.irfft2(transforms, s=(stamp, stamp), overwrite_x=True)
+        unfold(images, rows, scene.x, scene.y, first, scene.kind, scene.matrix, light)
+        add(image, images, rows, scene.x, scene.y)
 
 
 def _needed(weights: np.ndarray, peaks: np.ndarray, tolerance: float) -> np.ndarray:
@@ -259,6 +275,13 @@ def component_radii(scene: Scene, faintest: float) -> np.ndarray:
         disk = np.log(flux / (2 * np.pi * EXPONENTIAL_RADIUS**2 * area * faintest)) * EXPONENTIAL_RADIUS
         bulge = (1 + np.maximum(np.log(flux / (22.67 * area * faintest)) / 7.669, -1)) ** 4
     radius = np.where(scene.kind == EXPONENTIAL, disk, np.where(scene.kind == DEVAUCOULEURS, bulge, 0.0))
+    # what lies beyond half a stamp is not convolved as it should be: of objects that will be measured, a thousandth
+    bright = scene.fluxes()[scene.owner] > _MEASURED * faintest
+    radius = np.where(
+        bright,
+        np.maximum(radius, np.select([scene.kind == EXPONENTIAL, scene.kind == DEVAUCOULEURS], [5.5, 10.0])),
+        radius,
+    )
     # knots are Gaussian scattered; none of a hundred lies beyond about 3.5 sigma
     radius = np.where(scene.kind == KNOTS, 3.5 * KNOT_SIGMA, radius)
     smoothing = 4 * np.sqrt((scene.smoothing**2).sum(axis=(1, 2)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -79,24 +80,45 @@ def touching_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 def covering_sums(footprints: np.ndarray, ra, dec, weights: np.ndarray | None = None) -> np.ndarray:
     """Return, for positions in degrees, the sum of the weights (n,), or the number, of the footprints over them.
 
-    Footprints (n, 4, 2), degrees, are convex and much smaller than the sky; edges are arcs of great circles.
+    Footprints are those of `covering_pairs`.
     """
     ra, dec = np.broadcast_arrays(np.asarray(ra, float), np.asarray(dec, float))
-    points = unit_vectors(ra.ravel(), dec.ravel())
-    sums = np.zeros(len(points))
+    share = np.ones(len(footprints)) if weights is None else np.asarray(weights, float)
+    sums = np.zeros(ra.size)
+    for which, point in _covering(footprints, ra.ravel(), dec.ravel()):
+        sums += np.bincount(point, weights=share[which], minlength=ra.size)
+    return sums.reshape(ra.shape)
+
+
+def covering_pairs(footprints: np.ndarray, ra, dec, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index pairs (footprint, position) of positions in degrees that lie in footprints, sorted.
+
+    Footprints (n, 4, 2), degrees, are convex and much smaller than the sky; edges are arcs of great circles, and
+    positions up to `margin` arcsec outside an edge count as inside.
+    """
+    parts = [np.stack(pair) for pair in _covering(footprints, np.asarray(ra, float), np.asarray(dec, float), margin)]
+    which, point = np.concatenate([np.empty((2, 0), int), *parts], axis=1)
+    order = np.lexsort((point, which))
+    return which[order], point[order]
+
+
+def _covering(
+    footprints: np.ndarray, ra: np.ndarray, dec: np.ndarray, margin: float = 0.0
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the pairs of `covering_pairs`, some thousands of footprints at a time."""
+    points = unit_vectors(ra, dec)
     tree = cKDTree(points) if len(points) else None
     for start in range(0, len(footprints) if tree is not None else 0, _FOOTPRINTS):
-        part = slice(start, start + _FOOTPRINTS)
-        corners = unit_vectors(footprints[part, :, 0], footprints[part, :, 1])
+        corners = unit_vectors(*np.moveaxis(footprints[start : start + _FOOTPRINTS], -1, 0))
         middle, radius = _caps(corners)
-        near = cKDTree(middle).sparse_distance_matrix(tree, radius.max() + chord(1.0), output_type="ndarray")
+        reach = radius.max() + chord(1.0 + margin)
+        near = cKDTree(middle).sparse_distance_matrix(tree, reach, output_type="ndarray")
         which, point = near["i"], near["j"]
         normals = np.cross(corners, np.roll(corners, -1, axis=1))
         normals *= np.sign(np.einsum("nkc,nc->nk", normals, middle))[..., None]
-        inside = (np.einsum("pkc,pc->pk", normals[which], points[point]) >= 0).all(axis=1)
-        share = np.ones(len(middle)) if weights is None else np.asarray(weights, float)[part]
-        sums += np.bincount(point[inside], weights=share[which[inside]], minlength=len(points))
-    return sums.reshape(ra.shape)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        inside = (np.einsum("pkc,pc->pk", normals[which], points[point]) >= -margin * ARCSEC).all(axis=1)
+        yield which[inside] + start, point[inside]
 
 
 def _caps(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

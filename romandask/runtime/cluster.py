@@ -57,7 +57,7 @@ class InProcess:
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; a failure is not tried again."""
-        for task in tasks:
+        for task in sorted(tasks, key=lambda task: (task.kin, task.index)):
             try:
                 yield Outcome(task.index, make_unit(product, task, store))
             except Exception:
@@ -73,7 +73,7 @@ class OnCluster:
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; one that fails is tried up to three times."""
-        waiting = sorted(tasks, key=lambda task: (-task.cost, task.index))[::-1]
+        waiting = sorted(tasks, key=lambda task: (-task.cost, task.kin, task.index))[::-1]
         tries = {task.index: 0 for task in tasks}
         # the product goes to every worker once; a task carries only its number and its hash. It is the result of a
         # task, not scattered data: when the workers that hold it die the scheduler can make it again

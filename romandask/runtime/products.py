@@ -68,14 +68,17 @@ class ImageProduct:
         """Return the same product, reading what the store has."""
         return replace(self, store=store)
 
-    def load(self, index: int, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-        """Return the arrays of a unit: read where the manifest has it, made where not."""
+    def load(
+        self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()
+    ) -> dict[str, np.ndarray]:
+        """Return the arrays of a unit, or a window of them: read where the manifest has it, made where not."""
+        wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
         if self.store is not None and read_record(self.store, self.stage, self.names[index]):
             group = zarr.open_group(self.store.images(self.stage), mode="r")
             place = np.unravel_index(index, self.lengths)
-            wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
-            return {name: _array(group, name)[place] for name in wanted}
-        return self.make(index)
+            return {name: _array(group, name)[(*place, *window)] for name in wanted}
+        made = self.make(index)
+        return {name: made[name][window] for name in wanted}
 
     def prepare(self, store: Store) -> None:
         """Make the arrays and coordinates that units are written into."""
@@ -245,6 +248,16 @@ class TableProduct:
         meta = _with_lists(self.empty(), self.schema)
         return dd.from_map(load, chosen, meta=meta, label=f"{self.stage.replace('/', '-')}-within")
 
+    def rows_within(self, region: Region | Cone, ra: str = "ra", dec: str = "dec") -> pd.DataFrame:
+        """Return the rows of a region, of the partitions alone that it touches."""
+        load = _LoadWithin(self, region, ra, dec)
+        return self._together([load(index) for index in self.touching(region.cells(self.order or 0))])
+
+    def rows_where(self, name: str, values: np.ndarray, columns: list[str]) -> pd.DataFrame:
+        """Return some columns of all rows whose value of a column is among some."""
+        parts = (self.select(index, columns) for index in range(len(self.units)))
+        return self._together([part[np.isin(part[name].to_numpy(), values)] for part in parts])[columns]
+
     def column(self, name: str) -> np.ndarray:
         """Return one column of all rows."""
         parts = [self.select(index, [name])[name].to_numpy() for index in range(len(self.units))]
@@ -252,9 +265,12 @@ class TableProduct:
 
     def all_rows(self) -> pd.DataFrame:
         """Return the whole table in memory."""
-        parts = [self.load(index) for index in range(len(self.units))]
-        filled = [part for part in parts if len(part)] or parts[:1]
-        return pd.concat(filled, ignore_index=True) if filled else to_frame(self.schema.empty_table())
+        return self._together([self.load(index) for index in range(len(self.units))])
+
+    def _together(self, parts: list[pd.DataFrame]) -> pd.DataFrame:
+        """Return parts as one table; what is empty would change the types of columns."""
+        filled = [part for part in parts if len(part)]
+        return pd.concat(filled, ignore_index=True) if filled else self.empty()
 
     def _path(self, index: int, store: Store):
         if self.pixels is None:

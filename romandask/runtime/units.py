@@ -19,6 +19,8 @@ class Unit:
     """(stage, unit) of the upstream units that it reads."""
     cost: float = 1.0
     """Relative time, so that long units go first."""
+    kin: str = ""
+    """Units of one kin are made one after another: what a worker keeps for the one it has for the next."""
 
 
 @dataclass(frozen=True)

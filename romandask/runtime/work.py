@@ -20,6 +20,8 @@ class Task:
     inputs: str
     """Hash of what it depends on."""
     cost: float
+    kin: str = ""
+    """As that of its unit."""
 
 
 def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store) -> Record:

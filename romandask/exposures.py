@@ -173,9 +173,9 @@ def exposures(
         (len(table),),
         coordinates,
         {"survey": instrument.name},
-        # image, truth, dq, background and working copies; two PSF bases, the last and the new; the objects
-        # the wide PSF of one node, as sampled and as drawn; of the others, and of the core's modes, the samples
-        bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (350 << 20),
+        # image, truth, dq, background and working copies; the wide PSF of one node, as GalSim samples it or as it is
+        # drawn; the objects, and the PSFs of a detector and band, the last and the new
+        bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (500 << 20),
         # sky, noise and storage; then objects
         seconds_per_unit=ny * nx * 2.5e-7 + ny * nx * instrument.pixel_scale**2 / 3600 * 600 * 2.5e-4,
     )

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
-from typing import Literal
+from tempfile import TemporaryFile
+from typing import IO, Literal
 
 import galsim
 import galsim.roman
@@ -23,7 +24,6 @@ from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
 from romandask.kernels.psf import (
     CORE,
-    FAINTEST,
     BrightPsf,
     Grid,
     PsfModel,
@@ -244,19 +244,17 @@ class _WideNodes:
     diffusion: float
 
     def __call__(self) -> Iterator[np.ndarray]:
-        for lit, values in _wide_samples(self):
-            transform = np.zeros(self.grid.shape, np.complex64)
-            transform[np.unpackbits(lit, count=transform.size).view(bool).reshape(transform.shape)] = values
-            yield transform
+        file = _wide_samples(self)
+        file.seek(0)
+        for _ in self.waves:
+            yield np.fromfile(file, np.complex64, np.prod(self.grid.shape)).reshape(self.grid.shape)
 
 
 @lru_cache(maxsize=2)
-def _wide_samples(nodes: _WideNodes) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return, a node, the bits of the frequencies at which it has power, and its values there: sampling takes long."""
-    found = []
+def _wide_samples(nodes: _WideNodes) -> IO[bytes]:
+    """Return the samples, long in the making and large, in a file without a name, which ends with the worker."""
+    file = TemporaryFile(prefix="romandask-")
     for wave in nodes.waves:
         profile = _optics(nodes.sca, nodes.band, wave, nodes.pupil_bin)
-        transform = sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion)
-        lit = np.abs(transform) > FAINTEST
-        found.append((np.packbits(lit), transform[lit]))
-    return found
+        sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion).tofile(file)
+    return file

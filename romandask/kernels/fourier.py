@@ -123,18 +123,6 @@ def _phases(angle, lowest, out):
 
 
 @numba.njit(nogil=True, cache=True, fastmath=True)
-def _amplitudes(weights, real, imaginary, modes, re, im):
-    """Write the PSF: the sum of its first modes."""
-    for i in range(re.shape[0]):
-        re[i] = weights[0] * real[0, i]
-        im[i] = weights[0] * imaginary[0, i]
-    for m in range(1, modes):
-        for i in range(re.shape[0]):
-            re[i] += weights[m] * real[m, i]
-            im[i] += weights[m] * imaginary[m, i]
-
-
-@numba.njit(nogil=True, cache=True, fastmath=True)
 def _squares(matrix, kx, ky, out):
     """Write |M^T k|^2: the squared frequency in the frame in which the profile is round."""
     xx = np.float32(matrix[0, 0] ** 2 + matrix[0, 1] ** 2)
@@ -167,14 +155,23 @@ def _devaucouleurs(squares, table, re, im, total_re, total_im):
         total_im[i] += value * im[i]
 
 
+@numba.njit(nogil=True, cache=True)
+def _within(xx, xy, yy, y, step):
+    """Return how many frequencies 0, step, ... of a row at `y` a Gaussian leaves above 6e-6."""
+    if xx <= 0:
+        return 1 << 30
+    square = xy * xy * y * y - xx * (yy * y * y - 24.0)
+    if square < 0:
+        return 0
+    return max(0, int((np.sqrt(square) - xy * y) / (xx * step)) + 1)
+
+
 @numba.njit(nogil=True, cache=True, fastmath=True)
 def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, total_re, total_im):
     """Add points at the places that an identity gives, each smoothed by a Gaussian, of equal light."""
     xx = smoothing[0, 0] ** 2 + smoothing[0, 1] ** 2
     yy = smoothing[1, 0] ** 2 + smoothing[1, 1] ** 2
     xy = smoothing[0, 0] * smoothing[1, 0] + smoothing[0, 1] * smoothing[1, 1]
-    # least share of (k_y smoothing)^2 that any k_x leaves
-    least = yy - xy * xy / xx if xx > 0 else 0.0
     columns = np.empty((count, reach + 1), np.complex128)
     rows = np.empty((count, 2 * reach), np.complex128)
     for k in range(count):
@@ -186,8 +183,7 @@ def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, t
     sum_re, sum_im = np.empty(reach + 1, np.float32), np.empty(reach + 1, np.float32)
     for j in range(2 * reach):
         first, n = starts[j], starts[j + 1] - starts[j]
-        if n == 0 or least * (step * (j - reach)) ** 2 > 32.0:
-            continue
+        n = min(n, _within(xx, xy, yy, step * (j - reach), step))
         sum_re[:n] = 0
         sum_im[:n] = 0
         for k in range(count):
@@ -204,52 +200,63 @@ def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, t
 
 
 @numba.njit(nogil=True, cache=True, fastmath=True)
-def _fold(total_re, total_im, starts, columns, rows, reach, out):
-    """Add phases and fold frequencies to those of the pixel grid: (size, size / 2 + 1)."""
-    size = out.shape[0]
+def _fold(total_re, total_im, starts, columns, rows, reach, real, imaginary):
+    """Add phases and fold frequencies to those of the pixel grid: (size, size / 2 + 1), zeros at first."""
+    size = real.shape[0]
     half = size // 2
+    across_re = np.ascontiguousarray(columns.real).astype(np.float32)
+    across_im = np.ascontiguousarray(columns.imag).astype(np.float32)
     for j in range(2 * reach):
         first, n = starts[j], starts[j + 1] - starts[j]
         same = (j - reach) % size
         mirrored = (size - same) % size
+        a, b = np.float32(rows[j].real), np.float32(rows[j].imag)
         for low in range(0, n, half):
+            count = min(half + 1, n - low)
             # of each half of a period the one is copied, the other is its mirror image; their ends belong to both
             if (low // half) % 2 == 0:
-                for i in range(low, min(low + half + 1, n)):
-                    value = np.complex64(total_re[first + i] + 1j * total_im[first + i])
-                    out[same, i - low] += value * np.complex64(columns[i] * rows[j])
+                for i in range(count):
+                    p, q = across_re[low + i], across_im[low + i]
+                    c, d = p * a - q * b, p * b + q * a
+                    r, t = total_re[first + low + i], total_im[first + low + i]
+                    real[same, i] += r * c - t * d
+                    imaginary[same, i] += r * d + t * c
             else:
-                for i in range(low, min(low + half + 1, n)):
-                    value = np.complex64(total_re[first + i] - 1j * total_im[first + i])
-                    out[mirrored, half - (i - low)] += value * np.complex64(np.conj(columns[i] * rows[j]))
+                for i in range(count):
+                    p, q = across_re[low + i], across_im[low + i]
+                    c, d = p * a - q * b, p * b + q * a
+                    r, t = total_re[first + low + i], total_im[first + low + i]
+                    real[mirrored, half - i] += r * c - t * d
+                    imaginary[mirrored, half - i] -= r * d + t * c
 
 
 @numba.njit(nogil=True, cache=True)
 def fill(
-    out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, weights, modes,
-    starts, kx, ky, real, imaginary, reach, table,
+    out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, begin, real, imaginary, starts, kx, ky, table
 ):  # fmt: skip
-    """Add the folded transforms of objects to `out` (stamps, size, size / 2 + 1); stamps begin at floor(x) - size / 2.
+    """Write the folded transforms of objects to `out` (stamps, size, size / 2 + 1); they begin at floor(x) - size / 2.
 
     Parameters
     ----------
     chosen : (stamps,) numbers of the objects
     first : (objects + 1,) number of the first component of each
-    weights : (components, modes of the PSF) float32
-    modes : (components,) how many of them are needed
+    begin : (stamps,) row of the PSF of the first component of each
+    real, imaginary : (components of these objects, points) float32: the PSF of each, times its light
     """
     size = out.shape[1]
     step = 2 * np.pi / size
-    points = kx.shape[0]
-    re, im, squares = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, np.float32)
+    points, reach = kx.shape[0], (starts.shape[0] - 1) // 2
+    squares = np.empty(points, np.float32)
     total_re, total_im = np.empty(points, np.float32), np.empty(points, np.float32)
     columns, rows = np.empty(reach + 1, np.complex128), np.empty(2 * reach, np.complex128)
+    folded_re = np.empty((size, size // 2 + 1), np.float32)
+    folded_im = np.empty((size, size // 2 + 1), np.float32)
     for s in range(chosen.shape[0]):
         n = chosen[s]
         total_re[:] = 0
         total_im[:] = 0
         for c in range(first[n], first[n + 1]):
-            _amplitudes(weights[c], real, imaginary, modes[c], re, im)
+            re, im = real[begin[s] + c - first[n]], imaginary[begin[s] + c - first[n]]
             if kind[c] == POINT:
                 for i in range(points):
                     total_re[i] += re[i]
@@ -266,7 +273,12 @@ def fill(
                     _devaucouleurs(squares, table, re, im, total_re, total_im)
         _phases(step * (x[n] - np.floor(x[n]) + size // 2), 0, columns)
         _phases(step * (y[n] - np.floor(y[n]) + size // 2), -reach, rows)
-        _fold(total_re, total_im, starts, columns, rows, reach, out[s])
+        folded_re[:] = 0
+        folded_im[:] = 0
+        _fold(total_re, total_im, starts, columns, rows, reach, folded_re, folded_im)
+        for j in range(size):
+            for i in range(size // 2 + 1):
+                out[s, j, i] = np.complex64(folded_re[j, i] + 1j * folded_im[j, i])
 
 
 @numba.njit(nogil=True, cache=True)

@@ -15,7 +15,7 @@ from romandask.kernels.fourier import Frequencies, frequencies
 
 _NEGLIGIBLE = 1e-7
 """Surface brightness of a unit star, 1/pixel, below which a mode of the PSF's variation is left out."""
-FAINTEST = 1e-7
+FAINTEST = 1e-5
 """Share of a transform's largest value below which it is taken for empty."""
 CORE = 128
 """Largest stamp, pixels, on which the variation over the detector is followed."""

@@ -31,10 +31,11 @@ from romandask.kernels.psf import BrightPsf, Grid, PsfModel, stamp_frequencies, 
 SMALLEST = 32
 """Smallest stamp, pixels a side."""
 _BATCH_BYTES = 1 << 24
+"""Of the PSFs, or the images, of objects that are drawn together."""
 _MEASURED = 1000
 """Of `faintest`: objects with more light are drawn on stamps that hold all but a thousandth of a disk."""
-_PRECISION = 0.1
-"""Modes of the PSF are left out where together they change no pixel by more than this share of `faintest`."""
+_PRECISION = 3e-4
+"""Modes of the PSF are left out where together they change no pixel by more than this share of a star's peak."""
 
 
 @dataclass(frozen=True)
@@ -147,14 +148,15 @@ def _draw_core(
     weights = psf.weights(photons, x, y)
     far = wide[scene.owner]
     weights[far] = psf.shifted(photons[far], x[far], y[far])
-    modes = _needed(weights, psf.peaks, faintest * _PRECISION)
+    peak = photons.sum(axis=1) * np.float32(psf.peaks[0])
+    modes = _needed(weights, psf.peaks, np.clip(peak * _PRECISION, 0.05 * faintest, 0.5 * faintest))
     first = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
     core = np.minimum(size, psf.core.size)
     if not psf.degree:
         core = np.where(wide, 0, core)
     for stamp in np.unique(core[core > 0]):
         waves = psf.frequencies(int(stamp))
-        _draw(image, scene, np.flatnonzero(core == stamp), first, weights, modes, waves, int(stamp), psf.grid.folds)
+        _draw(image, scene, np.flatnonzero(core == stamp), first, weights, modes, waves, int(stamp))
 
 
 def _draw_middle(image: np.ndarray, scene: Scene, psf: PsfModel, size: np.ndarray) -> None:
@@ -164,7 +166,7 @@ def _draw_middle(image: np.ndarray, scene: Scene, psf: PsfModel, size: np.ndarra
     every = np.full(len(scene.owner), weights.shape[1])
     for stamp in np.unique(size[size > 0]):
         waves = psf.wide_frequencies(int(stamp))
-        _draw(image, scene, np.flatnonzero(size == stamp), first, weights, every, waves, int(stamp), psf.grid.folds)
+        _draw(image, scene, np.flatnonzero(size == stamp), first, weights, every, waves, int(stamp))
 
 
 def draw_wide(
@@ -197,7 +199,7 @@ def draw_wide(
         for stamp in sizes:
             waves = stamp_frequencies(transform[None], fine, grid, int(stamp))
             chosen = np.flatnonzero(size == stamp)
-            _draw(image, scene, chosen, first, weights, one, waves, int(stamp), grid.folds)
+            _draw(image, scene, chosen, first, weights, one, waves, int(stamp))
 
 
 def _draw(
@@ -209,27 +211,35 @@ def _draw(
     modes: np.ndarray,
     waves: Frequencies,
     stamp: int,
-    folds: int,
 ) -> None:
-    batch = max(1, _BATCH_BYTES // (stamp * stamp * 8))
     light = weights @ waves.totals[: weights.shape[1]]
-    for start in range(0, len(chosen), batch):
-        rows = chosen[start : start + batch]
-        transforms = np.zeros((len(rows), stamp, stamp // 2 + 1), np.complex64)
+    count = np.diff(first)[chosen]
+    # objects that need as many modes together: one product of matrices gives the PSFs of all their components
+    needed = np.zeros(len(scene.x), int)
+    np.maximum.at(needed, scene.owner, modes)
+    needed = needed[chosen]
+    order = np.argsort(needed, kind="stable")
+    room = max(1, _BATCH_BYTES // max(stamp * stamp * 4, int(count.max(initial=1)) * len(waves.x) * 8))
+    for start in range(0, len(chosen), room):
+        part = order[start : start + room]
+        rows, most = chosen[part], int(needed[part].max())
+        begin = np.concatenate([[0], np.cumsum(count[part])])
+        own = np.repeat(first[rows] - begin[:-1], count[part]) + np.arange(begin[-1])
+        psfs = [np.ascontiguousarray(weights[own, :most]) @ plane[:most] for plane in (waves.real, waves.imaginary)]
+        transforms = np.empty((len(rows), stamp, stamp // 2 + 1), np.complex64)
         fill(
             transforms, rows, scene.x, scene.y, scene.key, first, scene.kind, scene.matrix, scene.smoothing,
-            scene.knots, weights, modes, waves.starts, waves.x, waves.y, waves.real, waves.imaginary,
-            folds * stamp // 2, devaucouleurs_table(),
+            scene.knots, begin, *psfs, waves.starts, waves.x, waves.y, devaucouleurs_table(),
         )  # fmt: skip
         images = fft.irfft2(transforms, s=(stamp, stamp), overwrite_x=True)
         unfold(images, rows, scene.x, scene.y, first, scene.kind, scene.matrix, light)
         add(image, images, rows, scene.x, scene.y)
 
 
-def _needed(weights: np.ndarray, peaks: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return how many modes each component needs so that those left out stay below a surface brightness."""
+def _needed(weights: np.ndarray, peaks: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
+    """Return how many modes each component needs so that those left out stay below a surface brightness, its own."""
     rest = np.cumsum((np.abs(weights) * peaks.astype(np.float32))[:, ::-1], axis=1)[:, ::-1]
-    return np.maximum((rest > tolerance).sum(axis=1), 1)
+    return np.maximum((rest > tolerance[:, None]).sum(axis=1), 1)
 
 
 def stamp_sizes(scene: Scene, edges: dict[int, float], faintest: float, largest: np.ndarray | int) -> np.ndarray:

@@ -20,7 +20,9 @@ from rich.console import Console  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
+from romandask.calibration import check_files, make_files  # noqa: E402
 from romandask.export import export_meds, export_obseq, export_psf, export_truth  # noqa: E402
+from romandask.instruments.roman_focal_plane import SCAS  # noqa: E402
 from romandask.model.config import read_yaml  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.model.sky import Cone  # noqa: E402
@@ -41,6 +43,8 @@ ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a
 app.add_typer(ingest_app, name="ingest")
 export_app = typer.Typer(no_args_is_help=True, help="Write a survey's contents in other formats.")
 app.add_typer(export_app, name="export")
+calibration_app = typer.Typer(no_args_is_help=True, help="Calibration files of Roman's detectors.")
+app.add_typer(calibration_app, name="calibration")
 
 Source = Annotated[
     str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
@@ -259,6 +263,26 @@ def export_meds_files(
     of = Cone(*cone) if cone is not None else ids or []
     for path in export_meds(open_survey(store), out, of, band or [], size, catalog):
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@calibration_app.command("make")
+def calibration_make(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="The same files from the same seed.")] = 0,
+    sca: Annotated[list[int] | None, typer.Option("--sca", help="SCA, 1-18; may be repeated; default: all.")] = None,
+) -> None:
+    """Make calibration files of made-up detectors, with the statistics of the real ones: 1.6 GB an SCA."""
+    for path in make_files(out, seed, sca or SCAS):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@calibration_app.command("check")
+def calibration_check(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of sca01.fits to sca18.fits.")],
+) -> None:
+    """Check that calibration files have every extension of table 1 of Troxel et al. (2023), with its type and shape."""
+    for path in check_files(folder):
+        Console().print(f"{path}: as it should be", highlight=False, soft_wrap=True)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "romandask"
 LAYERS = [
     {"cli"},
-    {"report", "export"},
+    {"report", "export", "calibration"},
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
@@ -101,7 +101,7 @@ def test_every_path_and_command_that_the_readme_names_exists():
     for name in re.findall(
         r"romandask (plan|run|status|report|ingest|\w+) ", " ".join(re.findall(r"^romandask .*$", text, re.M))
     ):
-        assert name in {"plan", "run", "status", "report", "ingest", "export"}
+        assert name in {"plan", "run", "status", "report", "ingest", "export", "calibration"}
 
 
 def test_ci_runs_the_test_command_of_the_readme():

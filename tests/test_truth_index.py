@@ -8,7 +8,7 @@ import pytest
 from astropy.wcs import WCS
 
 from romandask.exposures import RenderExposure
-from romandask.kernels.scene import BAD_FLUX, BAD_LENSING, BAD_SIZE
+from romandask.kernels.scene import BAD_FLUX, BAD_LENSING, BAD_SIZE, NO_PLACE
 from romandask.truth_index import truth_index
 
 
@@ -55,6 +55,8 @@ def test_what_cannot_be_drawn_has_its_reason_and_no_pixel(small, index):
         "size_disk_true": (np.nan, BAD_SIZE), "size_minor_disk_true": (-0.1, BAD_SIZE),
         "convergence": (1.5, BAD_LENSING),
         "shear_1": (np.nan, BAD_LENSING), "disk_magnorm": (-60.0, BAD_FLUX),
+        # behind the projection, and at its pole
+        "ra": (233.0, NO_PLACE), "dec": (90.0, NO_PLACE),
     }  # fmt: skip
     inside = index.query("kind == 'galaxy' and 40 < x < 260 and 40 < y < 260")
     ids = inside.nlargest(len(wrong), "flux")["id"].to_numpy()

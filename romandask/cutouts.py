@@ -59,11 +59,9 @@ class Positions:
 
 @dataclass(frozen=True)
 class Frames:
-    """Images of one product, with all that cutouts need to know of them."""
+    """Images of one product, in the order of its units, with all that cutouts need to know of them."""
 
     product: ImageProduct
-    units: np.ndarray
-    """(frames,) number of each in the product."""
     footprints: np.ndarray
     """(frames, 4, 2) corners, degrees."""
     shape: tuple[int, int]
@@ -79,7 +77,7 @@ class Places:
     """Where objects are on images: one row a cutout, by image, then by object."""
 
     frame: np.ndarray
-    """(n,) number among the frames."""
+    """(n,) which of the frames."""
     row: np.ndarray
     """(n,) row of the table of objects."""
     x: np.ndarray
@@ -169,10 +167,10 @@ def find(frames: Frames, chosen: np.ndarray, objects: pd.DataFrame, size: int) -
     ra, dec = objects["ra"].to_numpy(float), objects["dec"].to_numpy(float)
     ny, nx = frames.shape
     which, point = covering_pairs(frames.footprints[chosen], ra, dec, _EDGE)
+    numbers, starts = np.unique(which, return_index=True)
     found: list[tuple[np.ndarray, ...]] = []
-    for number in np.unique(which):
-        rows = point[which == number]
-        header = frames.header(int(frames.units[chosen[number]]))
+    for number, rows in zip(numbers, np.split(point, starts)[1:], strict=True):
+        header = frames.header(int(chosen[number]))
         x, y, to_pixels = pixel_positions(WCS(header), ra[rows], dec[rows])
         inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
         rows, x, y, to_pixels = rows[inside], x[inside], y[inside], to_pixels[inside]
@@ -194,8 +192,7 @@ def _frames(product: ImageProduct) -> Frames:
         def of_exposure(unit: int) -> dict:
             return instrument.header(exposure_of(table.iloc[unit]))
 
-        rows = np.arange(len(table))
-        return Frames(product, rows, corners_of(table), instrument.shape, of_exposure, table["band"].to_numpy(object))
+        return Frames(product, corners_of(table), instrument.shape, of_exposure, table["band"].to_numpy(object))
     if isinstance(maker, DrizzleTile | DrawTile):
         source: RenderExposure = maker.exposures.make  # type: ignore[assignment]
         tiles, bands, scale = maker.tiles, source.instrument.bands, source.instrument.coadd_scale
@@ -205,9 +202,8 @@ def _frames(product: ImageProduct) -> Frames:
             return tiles[unit // len(bands)].header(maker.pixels, scale)
 
         corners = np.repeat(np.stack([tile.corners(side) for tile in tiles]), len(bands), axis=0)
-        rows = np.arange(len(corners))
         shape = (maker.pixels, maker.pixels)
-        return Frames(product, rows, corners, shape, of_tile, np.array(bands * len(tiles), object))
+        return Frames(product, corners, shape, of_tile, np.array(bands * len(tiles), object))
     raise TypeError("cutouts need the product that exposures() or coadds() returns")
 
 
@@ -219,12 +215,10 @@ def _dataset(
     used, counts = np.unique(places.frame, return_counts=True)
     data = {}
     if len(used):
-        settings = [product.units[unit].settings for unit in frames.units[used].tolist()]
+        settings = [product.units[unit].settings for unit in used.tolist()]
         token = digest(product.stage, places.frame, places.x, places.y, size, sorted(layers), settings)
         name = f"{product.stage.replace('/', '-')}-cutouts-{token}"
-        source = dask.delayed(
-            Cut(product, frames.units[used], _per_frame(places, used), tuple(layers), size), name=name
-        )
+        source = dask.delayed(Cut(product, used, _per_frame(places, used), tuple(layers), size), name=name)
         bundles = da.map_blocks(
             _cut_block, source, chunks=((1,) * len(used),), dtype=object, meta=np.empty(0, object), name=f"{name}-unit"
         )
@@ -237,7 +231,7 @@ def _dataset(
             )  # fmt: skip
         axis_names = ("v", "u") if layer == "psf" else ("y", "x")
         data[layer] = ((*axes, *axis_names), array, attributes)
-    unit_names = np.array(product.names, object)[frames.units[places.frame]]
+    unit_names = np.array(product.names, object)[places.frame]
     degrees = {"units": "deg"}
     pixel = {"units": "pixel", "description": "on the whole image, 0 at the centre of the first pixel"}
     first = {"units": "pixel", "description": "of the cutout's first pixel on the whole image"}

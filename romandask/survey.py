@@ -86,8 +86,8 @@ class Survey:
     def cutouts(
         self,
         of: Wanted,
-        layers: Sequence[str] = ("image",),
-        bands: Sequence[str] | None = None,
+        layers: str | Sequence[str] = ("image",),
+        bands: str | Sequence[str] | None = None,
         size: int = 48,
         survey: str = "roman",
         images: Literal["exposures", "coadds"] = "exposures",
@@ -111,6 +111,7 @@ class Survey:
         found = located(of, self.tables(catalog), catalog)
         kinds = {"exposures": self.exposure_product, "coadds": self.coadd_product}
         product = self._one(kinds, images, tuple(kinds))(survey)
+        layers, bands = ((names,) if isinstance(names, str) else names for names in (layers, bands))
         return cutouts(product, found, tuple(layers), None if bands is None else tuple(bands), size)
 
     def tables(self, catalog: str) -> tuple[Positions, ...]:

@@ -3,6 +3,7 @@
 from importlib.metadata import version as _version
 
 from romandask.coadds import coadds
+from romandask.cutouts import cutouts
 from romandask.detections import detections, objects
 from romandask.exposures import exposures
 from romandask.matches import matches
@@ -25,6 +26,7 @@ __all__ = [
     "Survey",
     "UserError",
     "coadds",
+    "cutouts",
     "detections",
     "exposures",
     "load_pipeline",

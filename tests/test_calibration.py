@@ -4,12 +4,24 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from conftest import command
+from scipy import stats
 
 from romandask.calibration import check_files, make_files
 from romandask.formats import calibration
 from romandask.formats.calibration import TABLE, check, flat, path_of, read
+from romandask.kernels import sca as sca_effects
 from romandask.kernels import synthetic_sca as sca
+from romandask.kernels.detector import Detector, observe
 from romandask.kernels.sca import STIMULI
+from romandask.kernels.sca_exposure import (
+    DISCONNECTED_FLAG,
+    HOT_FLAG,
+    PERSISTENCE_FLAG,
+    Response,
+    calibrate,
+    expose,
+    poisson,
+)
 from romandask.kernels.synthetic_sca import ADJACENT, BAD_BITS, DISCONNECTED, HOT, LOW_EFFICIENCY, NOISY, REFERENCE
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
@@ -116,6 +128,110 @@ def test_a_damaged_value_is_found(made):
             raw.seek(place)
             raw.write(byte)
     read(made, "GAIN")
+
+
+@pytest.fixture(scope="module")
+def planes(made):
+    """The calibrations in memory, as `expose` asks for them."""
+    kinds = {"CNL": np.float32, "READ": np.float32}
+    names = [extension.name for extension in TABLE if extension.dtype and not extension.name.endswith("FLAT")]
+    values = {name: read(made, name).astype(kinds.get(name, calibration.BY_NAME[name].dtype)) for name in names}
+
+    def get(name, rows):
+        return values[name] if name in ("BFE", "IPC", "GAIN") else values[name][..., rows, :]
+
+    return get
+
+
+@pytest.fixture(scope="module")
+def response():
+    """That of a band in which nothing depends on the wavelength."""
+    return Response(np.ones((64, 64), np.float32), np.ones((32, 32), np.float32), 139.8)
+
+
+def generators(name, block):
+    return rng(1, "exposures", name, block)
+
+
+def test_a_dark_exposure_has_the_moments_of_its_calibrations(planes, response):
+    numbers, dq = expose(np.zeros((4088, 4088), np.float32), planes, response, generators)
+    inner = (slice(4, -4), slice(4, -4))
+    gain = sca_effects.expand(planes("GAIN", slice(None)), 128, slice(0, 4096))[inner]
+    signal = (numbers.astype(float) - planes("BIAS", slice(0, 4096))[inner]) * gain
+    good = dq == 0
+    dark, read_noise = planes("DARK", slice(0, 4096))[inner] * 139.8, planes("READ", slice(0, 4096))[2][inner]
+    # a little of the hot pixels' charge appears in those at their corners
+    assert signal[good].mean() == pytest.approx(dark[good].mean(), abs=0.05)
+    variance = dark[good].mean() * 0.887 + np.mean(read_noise[good] ** 2) + np.mean(gain[good] ** 2) / 12
+    # interpixel capacitance averages the noise of the dark current over neighbours: 0.94^2 + 4 * 0.0135^2 + ...
+    assert signal[good].var() == pytest.approx(variance + dark[good].var() * 0.89, rel=5e-3)
+    hot = dq & HOT_FLAG > 0
+    assert np.median(signal[hot]) == pytest.approx(np.median(0.94 * np.minimum(dark[hot], 1.1e5)), rel=0.1)
+    dead = dq & DISCONNECTED_FLAG > 0
+    assert signal[dead].mean() == pytest.approx(0, abs=1)
+    again, _ = expose(np.zeros((4088, 4088), np.float32), planes, response, generators)
+    np.testing.assert_array_equal(again, numbers)
+
+
+def test_a_flat_is_found_again_with_its_variance(planes, response):
+    light = np.full((4088, 4088), 185.0, np.float32)
+    numbers, dq = expose(light, planes, response, generators)
+    image, variance = calibrate(numbers, planes, response)
+    good = dq == 0
+    assert good.mean() > 0.985
+    assert image[good].mean() == pytest.approx(185, rel=1e-3)
+    assert ((image[good] - 185) / np.sqrt(variance[good])).std() == pytest.approx(1, abs=0.015)
+    # what earlier exposures left comes on top, and is flagged
+    glow = np.zeros((4088, 4088), np.float32)
+    glow[1000:1100, 500:600] = 2.0
+    late, flags = expose(light, planes, response, generators, glow)
+    place = (slice(1000, 1100), slice(500, 600))
+    assert (flags[place] & PERSISTENCE_FLAG > 0).all()
+    assert (flags & PERSISTENCE_FLAG > 0).sum() == 10_000
+    change = calibrate(late, planes, response)[0][place] - image[place]
+    # fewer or more electrons are caught by weak pixels alone: take the others
+    assert np.median(change) == pytest.approx(2 * 139.8, rel=0.02)
+
+
+def test_stars_have_the_flux_that_the_simple_detector_gives_them(planes, response):
+    """Over 17 to 22 mag, in apertures that hold what the brighter-fatter effect moves, to 0.3%."""
+    side, sky = 32, 100.0
+    y, x = np.indices((side, side)) - 15.6
+    spot = np.exp(-(x**2 + y**2) / (2 * 1.3**2))
+    spot = (spot / spot.sum()).astype(np.float32)
+    n = 4088 // side
+    level = np.arange(n * n).reshape(n, n) % 6
+    fluxes = 8.4e5 * 10 ** (-0.4 * np.arange(6))
+    light = np.zeros((4088, 4088), np.float32)
+    tiles = light[: n * side, : n * side].reshape(n, side, n, side)
+    tiles += fluxes[level].astype(np.float32)[:, None, :, None] * spot[None, :, None, :]
+    numbers, dq = expose(light + np.float32(sky), planes, response, generators)
+    image, _ = calibrate(numbers, planes, response)
+    simple, _ = observe(light, np.float32(sky), Detector(1.1e5, 8.5), rng(1, "simple"))
+    bad = dq.astype(bool)[: n * side, : n * side].reshape(n, side, n, side).transpose(0, 2, 1, 3)[..., 6:26, 6:26]
+    clean = ~bad.any(axis=(2, 3))
+
+    def measured(array):
+        cut = array[: n * side, : n * side].reshape(n, side, n, side).transpose(0, 2, 1, 3)
+        return (cut[..., 6:26, 6:26] - np.float32(sky)).sum(axis=(2, 3), dtype=float)
+
+    ours, theirs = measured(image), measured(simple)
+    for k, flux in enumerate(fluxes):
+        own = clean & (level == k)
+        assert own.sum() > 50, k
+        scatter = theirs[own].std() / np.sqrt(own.sum()) / flux
+        assert ours[own].mean() / theirs[own].mean() == pytest.approx(1, abs=max(0.003, 4 * scatter)), k
+
+
+def test_poisson_numbers_of_small_means_are_poissons():
+    mean = np.repeat(np.array([0.0, 0.3, 2.1, 15.0, 400.0], np.float32), 200_000).reshape(5, -1)
+    numbers = poisson(mean, rng(1, "poisson"))
+    assert (numbers[0] == 0).all()
+    for row, expected in zip(numbers[1:], mean[1:, 0], strict=True):
+        assert row.mean() == pytest.approx(float(expected), abs=5 * float(np.sqrt(expected / 200_000)))
+        assert row.var() == pytest.approx(float(expected), rel=0.02)
+    share = np.mean(numbers[2][:, None] == np.arange(8), axis=0)
+    np.testing.assert_allclose(share, stats.poisson.pmf(np.arange(8), 2.1), atol=5e-3)
 
 
 def test_bad_files_are_said_in_one_line(tmp_path):

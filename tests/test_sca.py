@@ -7,6 +7,7 @@ import pytest
 
 from romandask.kernels import sca
 from romandask.kernels.brighter_fatter import brighter_fatter, potentials
+from romandask.kernels.cosmic_rays import hits, tracks
 from romandask.kernels.synthetic_sca import AREAS, area_kernels, capacitance
 from romandask.model.seeds import rng
 
@@ -190,6 +191,29 @@ def test_the_mean_over_a_band_is_that_of_interpolated_planes():
     at, weights = np.linspace(900, 1100, 31), np.linspace(1, 2, 31)
     mean = sca.band_mean(planes, wave, at, weights)
     np.testing.assert_allclose(mean, np.full((2, 3), 2 + np.average(at, weights=weights) / 1000))
+
+
+def test_cosmic_rays_have_the_rate_and_the_lengths_of_an_isotropic_flux():
+    found = tracks((4096, 4096), 139.8, rng(1, "rays"))
+    # 1.3e4 on an SCA
+    assert len(found) == pytest.approx(5.5 * 4.096**2 * 139.8, abs=5 * np.sqrt(1.3e4))
+    length = np.hypot(found[:, 2], found[:, 3])
+    # across: tan of the angle in units of half a pixel, cos^2 uniform: the median's tan is 1
+    assert np.median(length) == pytest.approx(0.5, rel=0.05)
+    assert np.mean(length > 1.5) == pytest.approx(1 / (1 + 9), rel=0.1)
+    # Moyal's median, 0.79 widths above the most probable, at 45 degrees
+    upright = length < 0.05
+    assert np.median(found[upright, 4]) == pytest.approx(2500 * (1 + 0.15 * 0.79), rel=0.05)
+
+
+def test_tracks_leave_all_their_charge_in_the_pixels_that_they_cross():
+    image = hits((20, 20), np.array([[3.0, 5.0, 10.0, 0.0, 1000.0], [10.2, 12.0, 0.0, 0.0, 50.0]]))
+    assert image.sum() == pytest.approx(1050)
+    np.testing.assert_allclose(image[5, 4:13], 100, rtol=0.15)
+    assert image[12, 10] == 50
+    assert (image[[4, 6]] == 0).all()
+    beyond = hits((20, 20), np.array([[18.0, 5.0, 10.0, 0.0, 1000.0]]))
+    assert beyond.sum() == pytest.approx(150, rel=0.1)
 
 
 def test_charge_is_clipped_and_data_numbers_are_whole():

@@ -64,6 +64,7 @@ def expose(
     response: Response,
     generators: Generators,
     afterglow: np.ndarray | None = None,
+    rays: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return data numbers (uint16) and dq (uint8), both (4088, 4088), of an exposure.
 
@@ -71,6 +72,7 @@ def expose(
     ----------
     light : (4088, 4088) expected electrons of objects, sky and thermal emission, at nominal efficiency
     afterglow : (4088, 4088) current, e/s, of charge that earlier exposures left; None for none
+    rays : (4096, 4096) electrons of cosmic rays (cosmic_rays.hits); None for none
     """
     inner = slice(BORDER, SIDE - BORDER)
     dq = np.zeros((SIDE, SIDE), np.uint8)
@@ -81,6 +83,8 @@ def expose(
         mean = count_rate_nonlinearity(mean, planes("CRNL", rows)[0], response.exptime)
         caught = generators("light", block).poisson(np.maximum(mean, 0))
         charge[rows] = quantum_yield(caught, expand(response.electrons, 128, rows), generators("yield", block))
+    if rays is not None:
+        charge += rays
     charge = brighter_fatter(charge, planes("BFE", slice(None)), 128)
     for block, rows in enumerate(_blocks()):
         dark = planes("DARK", rows) * np.float32(response.exptime)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
 from tempfile import TemporaryFile
-from typing import IO, Literal
+from typing import Literal
 
 import galsim
 import galsim.roman
@@ -244,17 +244,27 @@ class _WideNodes:
     diffusion: float
 
     def __call__(self) -> Iterator[np.ndarray]:
-        file = _wide_samples(self)
+        file = _wide_samples(self).file
         file.seek(0)
         for _ in self.waves:
             yield np.fromfile(file, np.complex64, np.prod(self.grid.shape)).reshape(self.grid.shape)
 
 
+class _Samples:
+    """Transforms one after another in a file without a name, which ends with this, or with the worker."""
+
+    def __init__(self) -> None:
+        self.file = TemporaryFile(prefix="romandask-")
+
+    def __del__(self) -> None:
+        self.file.close()
+
+
 @lru_cache(maxsize=2)
-def _wide_samples(nodes: _WideNodes) -> IO[bytes]:
-    """Return the samples, long in the making and large, in a file without a name, which ends with the worker."""
-    file = TemporaryFile(prefix="romandask-")
+def _wide_samples(nodes: _WideNodes) -> _Samples:
+    """Return the samples of some nodes: long in the making, and large."""
+    samples = _Samples()
     for wave in nodes.waves:
         profile = _optics(nodes.sca, nodes.band, wave, nodes.pupil_bin)
-        sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion).tofile(file)
-    return file
+        sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion).tofile(samples.file)
+    return samples

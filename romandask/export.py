@@ -101,11 +101,12 @@ def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size
     layers = ("image", "background", "weight", "dq", "psf")
     every = {band: survey.cutouts(objects, layers, (band,), size) for band in bands}
     _prepare(folder)
-    table, names = survey.pointings("roman"), survey.exposure_product("roman").names
+    names = survey.exposure_product("roman").names
+    exptimes = dict(zip(names, survey.pointings("roman")["exptime"], strict=True))
     written = []
     for band, found in every.items():
         units, image = np.unique(found["unit"].to_numpy(), return_inverse=True)
-        exptime = table["exptime"].to_numpy()[[names.index(name) for name in units]]
+        exptime = np.array([exptimes[name] for name in units])
         zero = 2.5 * np.log10(survey.instruments["roman"].bandpass(band).ab_photons() * exptime)
         derivatives = found["jacobian"].to_numpy()
         columns = {name: found[name].to_numpy() for name in ("object", "column", "row")}

@@ -1,16 +1,24 @@
-"""Calibrations of Roman's detectors: files made from a seed, or files that are there, checked."""
+"""Calibrations of Roman's detectors: files made from a seed or checked, and the stage from which workers read rows."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from romandask.formats.calibration import check, path_of, write
+from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.roman_focal_plane import SCAS
-from romandask.kernels.synthetic_sca import planes
+from romandask.kernels.sca import STIMULI
+from romandask.kernels.synthetic_sca import WAVES, planes
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
+from romandask.runtime.products import Coordinates, ImageProduct
+from romandask.runtime.store import Variable
+from romandask.runtime.units import Unit
 
 BYTES = 1_600_000_000
 """Of one file."""
@@ -57,3 +65,80 @@ def check_files(folder: Path) -> list[Path]:
     for path in found:
         check(path)
     return found
+
+
+_YX, _GRID = ("y", "x"), (4096, 4096)
+
+
+def _variable(name: str, dtype: str, shape: tuple[int, ...], axes: tuple[str, ...], unit: str, text: str) -> Variable:
+    # noise from pixel to pixel, which compresses by a tenth, and is read a block of rows at a time by every exposure
+    return Variable(name, dtype, shape, axes, {"units": unit, "long_name": text}, compress=False)
+
+
+_OF_64, _OF_128, _OF_8 = (("by", "bx"), ("cy", "cx"), ("ay", "ax"))
+VARIABLES = (
+    _variable("RELQE1", "float32", _GRID, _YX, "1", "relative quantum efficiency of pixels"),
+    _variable("RELQE2", "float32", (50, 64, 64), ("wave", *_OF_64), "1", "the same by wavelength, 64-pixel blocks"),
+    _variable("QYIELD", "float32", (50, 32, 32), ("wave", *_OF_128), "electron", "a photon, 128-pixel blocks"),
+    _variable("BFE", "float32", (5, 5, 32, 32), ("dy5", "dx5", *_OF_128), "1/electron", "brighter-fatter area kernel"),
+    _variable("PERSIST", "float32", (6, *_GRID), ("stimulus", *_YX), "electron", "persistence f(Q)"),
+    _variable("DARK", "float32", _GRID, _YX, "electron/s", "dark current"),
+    _variable("CRNL", "float32", (1, *_GRID), ("order", *_YX), "1", "exponent of the count rate"),
+    _variable("SATURATE", "int32", _GRID, _YX, "electron", "full well"),
+    _variable("CNL", "float32", (3, *_GRID), ("power", *_YX), "", "classical nonlinearity b2, b3, b4, 1/electron^k"),
+    _variable("IPC", "float32", (3, 3, 512, 512), ("dy3", "dx3", *_OF_8), "1", "interpixel capacitance, 8-pixel"),
+    _variable("BADPIX", "uint32", _GRID, _YX, "", "bad pixel bits"),
+    _variable("READ", "float32", _GRID, _YX, "electron", "read noise of an exposure, rms"),
+    _variable("GAIN", "float32", (32, 32), _OF_128, "electron/DN", "gain, 128-pixel blocks"),
+    _variable("BIAS", "uint16", _GRID, _YX, "DN", "bias"),
+)
+"""What exposures need of table 1: of READ the last plane, of CNL float32."""
+
+
+def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct:
+    """Return the lazy calibrations of some SCAs: dims (sca, ...), one variable an extension of the paper's table 1.
+
+    Stored, it is what all workers read: uncompressed, with checksums, a few rows at a time.
+
+    Raises
+    ------
+    UserError
+        If a file is missing, or not laid out as it should be.
+    """
+    source.check(scas)
+    units = tuple(Unit(f"sca{sca:02d}", {"sca": sca, "source": source.state(sca)}) for sca in scas)
+
+    def coordinates() -> Coordinates:
+        return {
+            "sca": (("sca",), np.array(scas, int), {}),
+            "wave": (("wave",), WAVES, {"units": "nm"}),
+            "stimulus": (("stimulus",), STIMULI, {"units": "electron"}),
+        }
+
+    maker = MakeCalibration(source, tuple(scas))
+    return ImageProduct(
+        "calibration/roman", units, maker, VARIABLES, ("sca",), (len(scas),), coordinates,
+        # the largest plane as it is made or read, and as it is stored
+        bytes_per_unit=1300 << 20,
+        seconds_per_unit=15.0,
+        stream=maker.stream,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MakeCalibration:
+    """Reads, or makes up, the calibrations of one SCA."""
+
+    source: CalibrationSource
+    scas: tuple[int, ...]
+
+    def __call__(self, index: int) -> dict[str, np.ndarray]:
+        """Return the planes of an SCA by name."""
+        return dict(self.stream(index))
+
+    def stream(self, index: int) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield the planes of an SCA, one after another."""
+        kinds = {variable.name: variable.dtype for variable in VARIABLES}
+        for name, values in self.source.planes(self.scas[index]):
+            if name in kinds:
+                yield name, (values[2] if name == "READ" else values).astype(kinds[name], copy=False)

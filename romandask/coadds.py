@@ -14,9 +14,9 @@ import pandas as pd
 import sep
 from astropy.wcs import WCS
 
-from romandask.exposures import RenderExposure, cone, header_text
+from romandask.exposures import RenderExposure, cone, empty_variance, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
-from romandask.kernels.detector import NO_DATA, SATURATED, noise_realisation
+from romandask.kernels.detector import noise_realisation, usable
 from romandask.kernels.drizzle import Strip, Sums, pixel_map, strips
 from romandask.kernels.fourier import POINT
 from romandask.kernels.psf import PsfModel
@@ -152,7 +152,7 @@ class DrizzleTile:
             wcs = WCS(header)
             parts = strips(wcs, instrument.shape, target, (self.pixels, self.pixels))
             if parts:
-                arrays = self.exposures.load(int(i), ("image", "dq"))
+                arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
                 sums.add(_planes_of(arrays, parts, instrument, exposure, header, target, source.seed))
                 _add_star(psf, instrument, exposure, wcs, tile, side)
         area = np.float32(scale**2)
@@ -233,7 +233,7 @@ def _planes_of(
     seed: int,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
     """Yield, for each strip, image and noise realisation in nJy/arcsec2, weight and map onto the tile."""
-    good = arrays["dq"] & (SATURATED | NO_DATA) == 0
+    good = usable(arrays["dq"])
     light = subtract_background(arrays["image"], ~good)
     to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
     identity = ("noise", instrument.name, exposure.visit, exposure.detector)
@@ -241,8 +241,9 @@ def _planes_of(
     for part in parts:
         here = (part.rows, part.columns)
         scale = to_njy / pixel_areas(header, instrument.shape, *here)
+        background = instrument.background(exposure, header, *here)
         noise = noise_realisation(
-            instrument.background(exposure, header, *here), instrument.detector, instrument.shape[1], *here,
+            empty_variance(arrays, background, instrument.detector, here), instrument.shape[1], *here,
             lambda block: rng(seed, "coadds", *identity, block),
         )  # fmt: skip
         weight = np.float32(exposure.exptime) * good[here]

@@ -13,9 +13,9 @@ import xarray as xr
 from astropy.wcs import WCS
 
 from romandask.coadds import DrawTile, DrizzleTile
-from romandask.exposures import RenderExposure
+from romandask.exposures import RenderExposure, empty_variance
 from romandask.instruments.exposure import exposure_of
-from romandask.kernels.detector import NO_DATA
+from romandask.kernels.detector import NO_DATA, usable
 from romandask.kernels.psf import fine_image
 from romandask.kernels.scene import pixel_positions
 from romandask.model.errors import UserError
@@ -27,7 +27,7 @@ from romandask.runtime.products import ImageProduct, TableProduct
 
 EXPOSURE_LAYERS = {
     "background": ("float32", "electron", "expected electrons that do not come from objects"),
-    "weight": ("float32", "1/electron2", "inverse variance of an empty pixel; 0 where dq says anything"),
+    "weight": ("float32", "1/electron2", "inverse variance of an empty pixel; 0 where dq forbids it"),
     "psf": ("float32", "1/pixel", "unit star, flat f_nu, at the object's place, centred on pixel size // 2"),
 }
 """Layers of exposures beside those that are stored: dtype, unit, what they hold."""
@@ -280,7 +280,9 @@ class Cut:
         low = np.clip(corners.min(axis=0), 0, np.array(shape[::-1]))
         high = np.clip(corners.max(axis=0) + self.size, 0, np.array(shape[::-1]))
         window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
-        wanted = {name for name in self.layers if name in own} | ({"dq"} if "weight" in self.layers else set())
+        wanted = {name for name in self.layers if name in own}
+        if "weight" in self.layers:
+            wanted |= {"dq", "image", "variance"}
         arrays = self.product.load(unit, tuple(sorted(wanted & set(own))), window) if wanted else {}
         made = {}
         if isinstance(maker, RenderExposure):
@@ -303,8 +305,8 @@ class Cut:
         background = instrument.background(exposure, instrument.header(exposure), *window)
         if "weight" not in self.layers:
             return {"background": background}
-        variance = background + np.float32(instrument.detector.read_noise**2)
-        return {"background": background, "weight": np.where(arrays["dq"] == 0, 1 / variance, np.float32(0))}
+        variance = empty_variance(arrays, background, instrument.detector)
+        return {"background": background, "weight": np.where(usable(arrays["dq"]), 1 / variance, np.float32(0))}
 
     def _stars(self, maker: RenderExposure, unit: int, at: np.ndarray) -> np.ndarray:
         """Return the PSF (n, size, size) at places of an exposure."""

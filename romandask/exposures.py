@@ -1,9 +1,13 @@
-"""Exposures: for each detector of each visit the observed image, the noiseless true one and the dq plane."""
+"""Exposures: for each detector of each visit the observed image, the noiseless true one and the dq plane.
+
+With the full model of the SCAs also what was read (raw), of which the image is the calibration, and its variance.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import galsim
 import numpy as np
@@ -12,16 +16,21 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of, exposures_of
-from romandask.kernels.detector import DQ_FLAGS, observe
+from romandask.instruments.roman import Roman
+from romandask.kernels.detector import DQ_FLAGS, Detector, observe
 from romandask.kernels.galsim_engine import draw_objects
 from romandask.kernels.render import Stamps, draw, plan_stamps
+from romandask.kernels.sca_exposure import FLAGS
 from romandask.kernels.scene import Drawable, Truth, build_scene
 from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
-from romandask.runtime.products import Coordinates, ImageProduct
-from romandask.runtime.store import Variable
+from romandask.readout import ScaReadout, before, exposures_before
+from romandask.runtime.manifest import read_record
+from romandask.runtime.products import Coordinates, ImageProduct, table_beside, to_frame
+from romandask.runtime.schemas import schema
+from romandask.runtime.store import Store, Variable, read_parquet
 from romandask.runtime.units import LazyUnits, Unit
 from romandask.truth import TruthCatalogs
 
@@ -56,6 +65,10 @@ class RenderExposure:
     instrument: Instrument
     render: RenderSettings
     seed: int
+    readout: ScaReadout | None = None
+    """None for the simple detector."""
+    store: Store | None = None
+    """Where what exposures left in traps may lie."""
 
     def view(self, index: int) -> View:
         """Return what the exposure at a row of the pointings table looks at."""
@@ -84,13 +97,26 @@ class RenderExposure:
         psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
         return draw(view.drawable.scene, psf, instrument.shape, view.stamps, view.faintest, bright)
 
-    def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, truth and dq of the exposure at a row of the pointings table."""
+    def __call__(self, index: int) -> dict[str, Any]:
+        """Return the arrays of the exposure at a row of the pointings table, by name, and its table of traps."""
         view = self.view(index)
         expected = self.expected(view)
+        if self.readout is not None:
+            left = [(exposure, self.trapped(row)) for row, exposure in exposures_before(self.table, index)]
+            return {**self.readout(view.exposure, expected + view.background, left), "truth": expected}
         random = rng(self.seed, "exposures", self.instrument.name, view.exposure.visit, view.exposure.detector)
         image, dq = observe(expected, view.background, self.instrument.detector, random)
         return {"image": image, "truth": expected, "dq": dq}
+
+    def trapped(self, index: int) -> pd.DataFrame:
+        """Return what an exposure left in traps: read where it is stored, worked out where not."""
+        assert self.readout is not None
+        exposure, stage = exposure_of(self.table.iloc[index]), stage_of(self.instrument)
+        if self.store is not None and read_record(self.store, stage, exposure.name):
+            return to_frame(read_parquet(table_beside(self.store, stage, "trapped", exposure.name)))
+        view = self.view(index)
+        charge, _ = self.readout.charge(exposure, self.expected(view) + view.background)
+        return self.readout.trapped(exposure, charge)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +144,27 @@ def _cell_profiles(profiles: Profiles, i: int, j: int) -> list[galsim.GSObject]:
     return profiles.instrument.profiles(profiles.exposure, x, y)
 
 
+def stage_of(instrument: Instrument) -> str:
+    """Return the name of the stage of an instrument's exposures."""
+    return f"exposures/{instrument.name}"
+
+
 def exposures(
-    table: pd.DataFrame, truth: TruthCatalogs, instrument: Instrument, render: RenderSettings, seed: int
+    table: pd.DataFrame,
+    truth: TruthCatalogs,
+    instrument: Instrument,
+    render: RenderSettings,
+    seed: int,
+    calibration: ImageProduct | None = None,
+    store: Store | None = None,
 ) -> ImageProduct:
-    """Return the lazy exposures of a pointings table: dims (exposure, y, x)."""
+    """Return the lazy exposures of a pointings table: dims (exposure, y, x).
+
+    Parameters
+    ----------
+    calibration : of Roman's SCAs, for the full model of the detector; None for the simple one
+    store : where what exposures left in traps may lie; None to work it out when it is needed
+    """
     ny, nx = instrument.shape
     common = {
         "render": render.model_dump(),
@@ -131,6 +174,11 @@ def exposures(
         "knot_smoothing": instrument.knot_smoothing,
     }
     every = exposures_of(table)
+    readout = None
+    if calibration is not None:
+        if not isinstance(instrument, Roman):
+            raise TypeError(f"{instrument.name}: calibrations are those of Roman's SCAs")
+        readout = ScaReadout(instrument, calibration, seed)
     names = [exposure.name for exposure in every]
     corners = corners_of(table)
 
@@ -138,7 +186,17 @@ def exposures(
         inputs = truth.inputs(*cone(corners[row]))
         # PSFs are those of a detector and band
         kin = f"{every[row].band}-{every[row].detector}"
-        return Unit(names[row], {**common, "row": row, **vars(every[row])}, inputs, kin=kin)
+        settings = {**common, "row": row, **vars(every[row])}
+        if readout is None:
+            return Unit(names[row], settings, inputs, kin=kin)
+        earlier = before(table, row).tolist()
+        # what an exposure leaves depends on its own light alone: on what was before it nothing else depends
+        lights = [source for k in earlier for source in truth.inputs(*cone(corners[k]))]
+        calibrated = (readout.calibration.stage, readout.calibration.names[readout.unit(every[row])])
+        inputs = tuple(dict.fromkeys([*inputs, *lights, calibrated]))
+        rays = readout.instrument.settings.cosmic_rays
+        settings |= {"before": [vars(every[k]) for k in earlier], "cosmic_rays": rays}
+        return Unit(names[row], settings, inputs, after=tuple(names[k] for k in earlier), kin=kin)
 
     axes = ("exposure",)
 
@@ -152,23 +210,11 @@ def exposures(
             "header": (axes, np.array(headers, object), text),
         }
 
-    flags = {"flag_masks": list(DQ_FLAGS.values()), "flag_meanings": " ".join(DQ_FLAGS)}
-    planes = (
-        Variable("image", "int32", (ny, nx), ("y", "x"), {"units": "electron", "long_name": "observed image"}),
-        Variable(
-            "truth",
-            "float32",
-            (ny, nx),
-            ("y", "x"),
-            {"units": "electron", "long_name": "noiseless image of the objects"},
-        ),
-        Variable("dq", "uint8", (ny, nx), ("y", "x"), {"long_name": "data quality", **flags}),
-    )
     return ImageProduct(
-        f"exposures/{instrument.name}",
+        stage_of(instrument),
         LazyUnits(tuple(names), unit),
-        RenderExposure(table, truth, instrument, render, seed),
-        planes,
+        RenderExposure(table, truth, instrument, render, seed, readout, store),
+        _variables(instrument.shape, readout is not None),
         axes,
         (len(table),),
         coordinates,
@@ -176,9 +222,46 @@ def exposures(
         # image, truth, dq, background and working copies; the wide PSF of one node, as GalSim samples it or as it is
         # drawn; the objects, and the PSFs of a detector and band, the last and the new
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (500 << 20),
-        # sky, noise and storage; then objects
-        seconds_per_unit=ny * nx * 2.5e-7 + ny * nx * instrument.pixel_scale**2 / 3600 * 600 * 2.5e-4,
+        # sky, noise and storage, every effect and its calibration; then objects
+        seconds_per_unit=ny * nx * ((2.5e-7 if readout is None else 7e-7) + instrument.pixel_scale**2 / 3600 * 0.15),
+        tables={} if readout is None else {"trapped": schema("trapped")},
     )
+
+
+def _variables(shape: tuple[int, int], full: bool) -> tuple[Variable, ...]:
+    """Return the arrays of an exposure, with the full model of the detector or the simple one."""
+    bits = {**DQ_FLAGS, **FLAGS} if full else DQ_FLAGS
+    masks = {"long_name": "data quality", "flag_masks": list(bits.values()), "flag_meanings": " ".join(bits)}
+    electrons = {"units": "electron"}
+    image = "calibrated image, sky included" if full else "observed image"
+    found = [
+        ("image", "float32" if full else "int32", {**electrons, "long_name": image}),
+        ("truth", "float32", {**electrons, "long_name": "noiseless image of the objects"}),
+        ("dq", "uint16" if full else "uint8", masks),
+    ]
+    if full:
+        found += [
+            ("raw", "uint16", {"units": "DN", "long_name": "what was read"}),
+            ("variance", "float32", {"units": "electron2", "long_name": "variance of the image"}),
+        ]
+    return tuple(Variable(name, kind, shape, ("y", "x"), attributes) for name, kind, attributes in found)
+
+
+def empty_variance(
+    arrays: dict[str, np.ndarray], background: np.ndarray, detector: Detector, window: tuple[slice, ...] = ()
+) -> np.ndarray:
+    """Return the variance (float32, electrons^2) that a window of an exposure would have without objects.
+
+    Parameters
+    ----------
+    arrays : whole arrays of the exposure; of the full model of a detector `image` and `variance` are used
+    background : expected electrons of the window
+    """
+    floor = np.float32(detector.read_noise**2)
+    if "variance" not in arrays:
+        return background + floor
+    # the image's own electrons are in its variance
+    return np.maximum(arrays["variance"][window] - (arrays["image"][window] - background), floor)
 
 
 def cone(corners: np.ndarray) -> tuple[float, float, float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -101,6 +101,8 @@ def stages(survey: Survey) -> list[Stage]:
     found += _with_margin("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec"))
     found.append(Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine))
     found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
+    if survey.pipeline.calibration() is not None:
+        found.append(Stage("calibration/roman", lambda s: s.calibration_product))
     found += [
         Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
         for name, instrument in survey.instruments.items()
@@ -256,7 +258,10 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
             outputs[source] = record.output if record else None
         return outputs[source]
 
-    tasks, blocked, kept = [], [], 0
+    tasks: dict[str, Task] = {}
+    blocked: list[str] = []
+    waiting: dict[str, tuple[str, ...]] = {}
+    kept = 0
     for index, unit in enumerate(product.units):
         upstream = [output(source) for source in unit.inputs]
         if None in upstream:
@@ -269,8 +274,23 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
             kept += 1
             continue
         store.record(product.stage, unit.name).unlink(missing_ok=True)
-        tasks.append(Task(index, inputs, unit.cost, unit.kin))
-    return tasks, kept, blocked
+        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin)
+        waiting[unit.name] = unit.after
+    held = _held(waiting, set(blocked))
+    chosen = [
+        replace(task, after=tuple(tasks[other].index for other in waiting[name] if other in tasks))
+        for name, task in tasks.items()
+        if name not in held
+    ]
+    return chosen, kept, blocked + sorted(held)
+
+
+def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
+    """Return the units that cannot be made because one that they come after cannot."""
+    held: set[str] = set()
+    while found := {name for name, after in waiting.items() if name not in held and set(after) & (missing | held)}:
+        held |= found
+    return held
 
 
 def _drop_strays(product: Product, store: Store) -> None:
@@ -297,7 +317,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
         failed = len(list(folder.glob("*.failed")))
         done = len(store.records(stage.name))
         known = not stage.name.startswith(
-            ("exposures", "truth_index", "coadds", "detections", "objects", "matches", "statistics")
+            ("calibration", "exposures", "truth_index", "coadds", "detections", "objects", "matches", "statistics")
         )
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)

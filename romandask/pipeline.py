@@ -10,6 +10,7 @@ from pydantic import Field
 
 from romandask.instruments.exposure import Instrument
 from romandask.instruments.roman import Roman, RomanSettings
+from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.rubin import Rubin, RubinSettings
 from romandask.model.config import (
     CoaddSettings,
@@ -49,10 +50,17 @@ class Pipeline(Section):
         """Return the instruments of this survey by name, in order."""
         found: dict[str, Instrument] = {}
         if self.roman is not None:
-            found["roman"] = Roman(self.roman, self.render.n_waves)
+            found["roman"] = Roman(self.roman, self.render.n_waves, self.calibration())
         if self.rubin is not None:
             found["rubin"] = Rubin(self.rubin, self.render.n_waves)
         return found
+
+    def calibration(self) -> CalibrationSource | None:
+        """Return where the calibrations of Roman's SCAs come from; None where they have none."""
+        if self.roman is None or self.roman.detector == "simple":
+            return None
+        folder = self.roman.calibration
+        return CalibrationSource(None if folder is None else Path(self.data) / folder, self.seed)
 
     def to_yaml(self) -> str:
         """Return the resolved settings as YAML."""

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from romandask.calibration import calibrations
 from romandask.coadds import coadds
 from romandask.cutouts import Positions, Wanted, cutouts, located
 from romandask.detections import detections, objects
@@ -72,7 +73,10 @@ class Survey:
         return visits(instrument, getattr(settings, survey).pointings, self.data, self.region, settings.seed)
 
     def exposures(self, survey: str) -> xr.Dataset:
-        """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ..."""
+        """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ...
+
+        With roman.detector: sca also raw and variance, and the image is the calibrated one.
+        """
         return self.exposure_product(survey).dataset
 
     def truth_index(self, survey: str) -> dd.DataFrame:
@@ -218,8 +222,20 @@ class Survey:
         return self._once(
             "exposures",
             survey,
-            lambda: exposures(self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed),
-        )
+            lambda: exposures(
+                self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed,
+                self.calibration_product if survey == "roman" and settings.calibration() else None, self.store,
+            ),
+        )  # fmt: skip
+
+    @property
+    def calibration_product(self) -> ImageProduct:
+        """The calibrations of the SCAs that Roman's exposures use."""
+        source = self.pipeline.calibration()
+        if source is None:
+            raise UserError("this survey has no calibrations: they belong to roman.detector: sca")
+        scas = sorted(set(self.pointings("roman")["detector"].tolist()))
+        return self._once("calibration", "roman", lambda: calibrations(source, scas))
 
     def truth_index_product(self, survey: str) -> TableProduct:
         """The truth index of an instrument's exposures."""

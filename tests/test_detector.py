@@ -40,9 +40,7 @@ def test_the_same_seed_gives_the_same_image():
 def test_a_noise_realisation_does_not_depend_on_the_part_asked_for():
     def part(rows, columns):
         shape = (rows.stop - rows.start, columns.stop - columns.start)
-        return noise_realisation(
-            np.full(shape, 100.0, np.float32), DETECTOR, 400, rows, columns, lambda k: rng(5, "n", k)
-        )
+        return noise_realisation(np.full(shape, 100 + 8.5**2, np.float32), 400, rows, columns, lambda k: rng(5, "n", k))
 
     whole = part(slice(0, 700), slice(0, 400))
     np.testing.assert_array_equal(whole[300:600, 37:90], part(slice(300, 600), slice(37, 90)))

@@ -13,7 +13,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "romandask"
 LAYERS = [
     {"cli"},
-    {"report", "export", "calibration"},
+    {"report", "export"},
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
@@ -21,9 +21,10 @@ LAYERS = [
     {"coadds"},
     {"truth_index", "psfs"},
     {"exposures"},
-    {"pointings", "truth"},
-    {"generated", "incoming"},
-    {"instruments", "formats", "runtime"},
+    {"pointings", "truth", "readout"},
+    {"generated", "incoming", "calibration"},
+    {"instruments", "runtime"},
+    {"formats"},
     {"kernels"},
     {"model"},
 ]

@@ -17,6 +17,7 @@ from galsim.roman import roman_psfs
 from pydantic import Field, NonNegativeInt, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
+from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.roman_focal_plane import SCAS, corners, header_of
 from romandask.instruments.roman_plan import reference_plan
 from romandask.instruments.roman_sun import FURTHEST, NEAREST, sun_angle
@@ -59,7 +60,15 @@ class RomanSettings(Section):
 
     bands: tuple[Literal["Y106", "J129", "H158", "F184"], ...] = ("Y106", "J129", "H158", "F184")
     pointings: RomanPointings = RomanPointings()
-    detector: Literal["simple"] = "simple"
+    detector: Literal["simple", "sca"] = Field(
+        "simple", description="sky, Poisson and read noise alone, or every effect of each SCA (paper, section 4.4)"
+    )
+    calibration: str | None = Field(
+        None,
+        description="folder of the SCAs' calibration files, below `data`, with detector: sca; where there is none SCAs "
+        "are made up from the seed",
+    )
+    cosmic_rays: bool = Field(False, description="with detector: sca")
     psf_degree: int = Field(
         5,
         ge=0,
@@ -71,6 +80,14 @@ class RomanSettings(Section):
         description="stars brighter than each magnitude: pupil pixels binned for their PSF (8 for all else)",
     )
     charge_diffusion: float = Field(0.0, ge=0, le=2, description="sigma, pixels, by which charge diffuses; 0 for none")
+
+    @model_validator(mode="after")
+    def _belongs_to_the_detector(self) -> RomanSettings:
+        if self.detector == "simple" and (self.calibration is not None or self.cosmic_rays):
+            raise ValueError("calibration and cosmic_rays need detector: sca")
+        if self.detector == "sca" and self.charge_diffusion:
+            raise ValueError("charge_diffusion is that of the calibration (CHRGDIFF) with detector: sca: leave it out")
+        return self
 
     @model_validator(mode="after")
     def _every_band_dithered(self) -> RomanSettings:
@@ -86,6 +103,8 @@ class Roman:
 
     settings: RomanSettings
     n_waves: int = 5
+    calibration: CalibrationSource | None = None
+    """With settings.detector: sca."""
     name: str = "roman"
     coadd_scale: float = 0.0575
     """arcsec"""
@@ -128,26 +147,30 @@ class Roman:
         """Return the exact TAN-SIP header of an exposure."""
         return header_of(exposure.detector, exposure.ra, exposure.dec, exposure.pa)
 
+    def diffusion(self, sca: int) -> float:
+        """Return sigma, pixels, by which charge diffuses before it is collected, of all objects alike."""
+        return self.settings.charge_diffusion if self.calibration is None else self.calibration.diffusion(sca)
+
     def psf(self, exposure: Exposure) -> PsfModel:
         """Return the PSF of an SCA and band, as it varies over the SCA."""
-        settings = self.settings
-        return _psf(exposure.detector, exposure.band, self.n_waves, settings.psf_degree, settings.charge_diffusion)
+        sca, degree = exposure.detector, self.settings.psf_degree
+        return _psf(sca, exposure.band, self.n_waves, degree, self.diffusion(sca))
 
     def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
         """Return the PSF at one place of the SCA, on stamps of up to 256 pixels."""
         if not self.settings.psf_degree:
             x, y = _MIDDLE.x - 0.5, _MIDDLE.y - 0.5
-        grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.settings.charge_diffusion
+        grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.diffusion(exposure.detector)
         profiles = self.profiles(exposure, x, y)
         return model(np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles]), grid)
 
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return how bright a unit star is at the edges of stamps."""
-        return _edges(exposure.detector, exposure.band, self.n_waves, self.settings.charge_diffusion)
+        return _edges(exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector))
 
     def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
         """Return the PSFs of bright stars: of finer pupils, which reach further out (paper, section 4.2)."""
-        bandpass, diffusion = self.bandpass(exposure.band), self.settings.charge_diffusion
+        bandpass, diffusion = self.bandpass(exposure.band), self.diffusion(exposure.detector)
         zero = bandpass.ab_photons() * exposure.exptime
         found = []
         for magnitude, pupil_bin in sorted(self.settings.bright_stars.items(), reverse=True):
@@ -168,7 +191,10 @@ class Roman:
         return [_optics(exposure.detector, exposure.band, wave, 8, place) for wave in nodes]
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
-        """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current."""
+        """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current.
+
+        An SCA's dark current is its calibration's own: with detector: sca it is not among them.
+        """
         coord = galsim.CelestialCoord(header["CRVAL1"] * galsim.degrees, header["CRVAL2"] * galsim.degrees)
         level = galsim.roman.getSkyLevel(
             galsim_roman_bandpasses()[exposure.band],
@@ -177,7 +203,8 @@ class Roman:
             exptime=exposure.exptime,
         )
         level *= 1 + galsim.roman.stray_light_fraction
-        flat = galsim.roman.thermal_backgrounds[exposure.band] + galsim.roman.dark_current
+        dark = galsim.roman.dark_current if self.calibration is None else 0.0
+        flat = galsim.roman.thermal_backgrounds[exposure.band] + dark
         return (pixel_areas(header, self.shape, rows, columns) * level + flat * exposure.exptime).astype(np.float32)
 
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SATURATED, NO_DATA = 1, 2
+SATURATED, NO_DATA, PERSISTENCE = 1, 2, 128
 DQ_FLAGS = {"saturated": SATURATED, "no_data": NO_DATA}
 """Bits of the dq plane."""
+TELLING = PERSISTENCE
+"""Bits that tell something of a pixel and leave it usable; one with any other is not used."""
 _ROWS = 256
 
 
@@ -56,29 +58,33 @@ NOISE_ROWS = 256
 """Rows whose noise realisation shares one generator: parts of an image need not draw the whole."""
 
 
+def usable(dq: np.ndarray) -> np.ndarray:
+    """True for pixels that may be measured."""
+    return dq & ~np.array(TELLING, dq.dtype) == 0
+
+
 def noise_realisation(
-    background: np.ndarray,
-    detector: Detector,
+    variance: np.ndarray,
     width: int,
     rows: slice,
     columns: slice,
     generator: Callable[[int], np.random.Generator],
 ) -> np.ndarray:
-    """Return the noise (float32, electrons) of an empty field: zero mean, the variance of background and read noise.
+    """Return noise (float32, electrons) of zero mean and some variance.
 
     Parameters
     ----------
-    background : (ny, nx) expected electrons of the rows and columns wanted
+    variance : (ny, nx) electrons^2, of the rows and columns wanted
     width : columns of the whole detector
     generator : the random generator of a block of rows, by its number
 
     The values of a pixel do not depend on which part of the detector is asked for.
     """
-    noise = np.empty(background.shape, np.float32)
+    noise = np.empty(variance.shape, np.float32)
     for block in range(rows.start // NOISE_ROWS, -(-rows.stop // NOISE_ROWS)):
         first, last = max(rows.start, block * NOISE_ROWS), min(rows.stop, (block + 1) * NOISE_ROWS)
         drawn = generator(block).standard_normal((NOISE_ROWS, width), dtype=np.float32)
         noise[first - rows.start : last - rows.start] = drawn[
             first - block * NOISE_ROWS : last - block * NOISE_ROWS, columns
         ]
-    return noise * np.sqrt(background + np.float32(detector.read_noise**2))
+    return noise * np.sqrt(variance)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 
 from romandask.kernels.brighter_fatter import brighter_fatter
-from romandask.kernels.detector import SATURATED
+from romandask.kernels.detector import PERSISTENCE, SATURATED
 from romandask.kernels.sca import (
+    STIMULI,
     count_rate_linearity,
     count_rate_nonlinearity,
     digitise,
@@ -18,6 +19,7 @@ from romandask.kernels.sca import (
     interpixel_capacitance,
     linear,
     nonlinear,
+    persistence,
     quantum_efficiency,
     quantum_yield,
     saturate,
@@ -25,23 +27,32 @@ from romandask.kernels.sca import (
 )
 from romandask.kernels.synthetic_sca import ADJACENT, BORDER, DISCONNECTED, HOT, LOW_EFFICIENCY, NOISY, SIDE
 
-DISCONNECTED_FLAG, HOT_FLAG, ADJACENT_FLAG, LOW_EFFICIENCY_FLAG, NOISY_FLAG, PERSISTENCE_FLAG = 4, 8, 16, 32, 64, 128
+DISCONNECTED_FLAG, HOT_FLAG, ADJACENT_FLAG, LOW_EFFICIENCY_FLAG, NOISY_FLAG = 4, 8, 16, 32, 64
+COSMIC_RAY_FLAG = 256
 FLAGS = {
     "disconnected": DISCONNECTED_FLAG, "hot": HOT_FLAG, "adjacent": ADJACENT_FLAG,
-    "low_efficiency": LOW_EFFICIENCY_FLAG, "noisy": NOISY_FLAG, "persistence": PERSISTENCE_FLAG,
+    "low_efficiency": LOW_EFFICIENCY_FLAG, "noisy": NOISY_FLAG, "persistence": PERSISTENCE,
+    "cosmic_ray": COSMIC_RAY_FLAG,
 }  # fmt: skip
-"""Bits of the dq plane beside those of the simple detector."""
+"""Bits of the dq plane (uint16) beside those of the simple detector."""
+JUMP = 50.0
+"""Electrons of a cosmic ray, in a pixel, that give it away among the reads of an exposure (six times their noise)."""
+LEAST = 0.1
+"""Electrons of trapped charge, f(Q), that are followed: a thousandth of the sky's noise an exposure is far below."""
 _OF_PIXELS = (
     (DISCONNECTED, DISCONNECTED_FLAG), (HOT, HOT_FLAG), (ADJACENT, ADJACENT_FLAG),
     (LOW_EFFICIENCY, LOW_EFFICIENCY_FLAG), (NOISY, NOISY_FLAG),
 )  # fmt: skip
-_ROWS = 512
+_ROWS = 1024
 """Rows that share a random generator."""
 _SMALL = 20.0
 """Expected electrons up to which Poisson numbers are found by inversion."""
 
 Planes = Callable[[str, slice], np.ndarray]
-"""Gives some rows of the whole detector (BORDER included) of a named calibration; blocks, whole, where it has those."""
+"""Gives some rows of the whole detector (BORDER included) of a named calibration; blocks, whole, where it has those.
+
+Of float64 calibrations float32 is enough; READ is the read noise of an exposure alone, electrons.
+"""
 Generators = Callable[[str, int], np.random.Generator]
 """Gives the random generator of a named step and a block of rows."""
 
@@ -58,24 +69,26 @@ class Response:
     """Seconds."""
 
 
-def expose(
-    light: np.ndarray,
-    planes: Planes,
-    response: Response,
-    generators: Generators,
-    afterglow: np.ndarray | None = None,
-    rays: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return data numbers (uint16) and dq (uint8), both (4088, 4088), of an exposure.
+@dataclass(frozen=True)
+class Trapped:
+    """Charge that an exposure leaves in traps, pixel by pixel: most have none worth following."""
+
+    pixel: np.ndarray
+    """(n,) int32, place in the flattened active area (4088, 4088)."""
+    charge: np.ndarray
+    """(n,) float32, f(Q), electrons; a time t later its current is f(Q) / t."""
+
+
+def accumulate(
+    light: np.ndarray, planes: Planes, response: Response, generators: Generators, rays: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the charge (4096, 4096), electrons, that light leaves in pixels, before anything the detector adds.
 
     Parameters
     ----------
     light : (4088, 4088) expected electrons of objects, sky and thermal emission, at nominal efficiency
-    afterglow : (4088, 4088) current, e/s, of charge that earlier exposures left; None for none
     rays : (4096, 4096) electrons of cosmic rays (cosmic_rays.hits); None for none
     """
-    inner = slice(BORDER, SIDE - BORDER)
-    dq = np.zeros((SIDE, SIDE), np.uint8)
     charge = np.empty((SIDE, SIDE), np.float32)
     for block, rows in enumerate(_blocks()):
         mean = _padded(light, rows)
@@ -85,19 +98,72 @@ def expose(
         charge[rows] = quantum_yield(caught, expand(response.electrons, 128, rows), generators("yield", block))
     if rays is not None:
         charge += rays
-    charge = brighter_fatter(charge, planes("BFE", slice(None)), 128)
+    return brighter_fatter(charge, planes("BFE", slice(None)), 128)
+
+
+def trap(charge: np.ndarray, planes: Planes) -> Trapped:
+    """Return what of a charge (4096, 4096) stays in traps.
+
+    Left out are pixels with less than half the least charge at which persistence is measured, and those that keep less
+    than LEAST.
+    """
+    found = []
+    for rows in _blocks():
+        first, last = max(rows.start, BORDER), min(rows.stop, SIDE - BORDER)
+        here = np.minimum(charge[first:last, BORDER : SIDE - BORDER], planes("SATURATE", slice(first, last))[
+            :, BORDER : SIDE - BORDER
+        ])  # fmt: skip
+        y, x = np.nonzero(here > STIMULI[0] / 2)
+        released = persistence(here[y, x], planes("PERSIST", slice(first, last))[:, y, x + BORDER], 1.0)
+        kept = released >= LEAST
+        pixel = (y[kept] + first - BORDER) * (SIDE - 2 * BORDER) + x[kept]
+        found.append((pixel.astype(np.int32), released[kept].astype(np.float32)))
+    return Trapped(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def afterglow(left: Sequence[tuple[Trapped, float]]) -> np.ndarray | None:
+    """Return the current (4088, 4088), e/s, of what exposures left, each with its age, s; None where there are none."""
+    if not left:
+        return None
+    side = SIDE - 2 * BORDER
+    current = np.zeros(side * side, np.float32)
+    for trapped, age in left:
+        current[trapped.pixel] += trapped.charge / np.float32(age)
+    return current.reshape(side, side)
+
+
+def read_out(
+    charge: np.ndarray,
+    planes: Planes,
+    response: Response,
+    generators: Generators,
+    late: np.ndarray | None = None,
+    rays: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return data numbers (uint16) and dq (uint16), both (4088, 4088), of the charge (4096, 4096) of an exposure.
+
+    Parameters
+    ----------
+    late : (4088, 4088) current, e/s, of charge that earlier exposures left (`afterglow`); None for none
+    rays : (4096, 4096) electrons of cosmic rays that are in the charge; None for none
+    """
+    inner = slice(BORDER, SIDE - BORDER)
+    dq = np.zeros((SIDE, SIDE), np.uint16)
+    if rays is not None:
+        dq[rays > JUMP] |= COSMIC_RAY_FLAG
+    signal = np.empty((SIDE, SIDE), np.float32)
     for block, rows in enumerate(_blocks()):
         dark = planes("DARK", rows) * np.float32(response.exptime)
-        if afterglow is not None:
-            late = _padded(afterglow, rows) * np.float32(response.exptime)
+        if late is not None:
+            added = _padded(late, rows) * np.float32(response.exptime)
             # what is more than the noise of the sky's own electrons in the least
-            dq[rows][late > 1] |= PERSISTENCE_FLAG
-            dark = dark + late
+            dq[rows][added > 1] |= PERSISTENCE
+            dark = dark + added
         electrons = np.rint(charge[rows]) + poisson(dark, generators("dark", block))
         electrons, full = saturate(electrons, planes("SATURATE", rows).astype(np.float32))
         dq[rows][full] |= SATURATED
-        charge[rows] = nonlinear(electrons, planes("CNL", rows).astype(np.float32))
-    signal = interpixel_capacitance(charge, planes("IPC", slice(None)), 8)
+        signal[rows] = nonlinear(electrons, planes("CNL", rows))
+    signal = interpixel_capacitance(signal, planes("IPC", slice(None)), 8)
     numbers = np.empty((SIDE, SIDE), np.uint16)
     for block, rows in enumerate(_blocks()):
         bits, here = planes("BADPIX", rows), signal[rows]
@@ -105,7 +171,7 @@ def expose(
         for bit, flag in _OF_PIXELS:
             dq[rows][bits & bit > 0] |= flag
         noise = generators("read", block).standard_normal(here.shape, np.float32)
-        here += noise * planes("READ", rows)[2].astype(np.float32)
+        here += noise * planes("READ", rows)
         numbers[rows] = digitise(here, expand(planes("GAIN", slice(None)), 128, rows), planes("BIAS", rows))
     return numbers[inner, inner], dq[inner, inner]
 
@@ -131,7 +197,7 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
     signal = without_capacitance(signal, kernels, 8)
     variance = np.empty((SIDE, SIDE), np.float32)
     for rows in _blocks():
-        electrons = linear(signal[rows], planes("CNL", rows).astype(np.float32), 3)
+        electrons = linear(signal[rows], planes("CNL", rows), 3)
         dark = planes("DARK", rows) * np.float32(response.exptime)
         relative = planes("RELQE1", rows) * expand(response.efficiency, 64, rows)
         relative = relative * expand(response.electrons, 128, rows)
@@ -139,7 +205,7 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
         # noise that was added after the signal had spread grows with its inverse, by the sum of its squares
         middle = expand(kernels[1, 1], 8, rows)
         grown = 1 / middle**2 * (1 + (1 - middle) ** 2 / 4 / middle**2)
-        read = planes("READ", rows)[2].astype(np.float32) ** 2 + gain**2 / 12
+        read = planes("READ", rows) ** 2 + gain**2 / 12
         lit = relative > 0
         safe = np.where(lit, relative, 1)
         light = count_rate_linearity((electrons - dark) / safe, planes("CRNL", rows)[0], response.exptime)

@@ -5,6 +5,7 @@ The only module that knows distributed.
 
 from __future__ import annotations
 
+import itertools
 import queue
 import socket
 import time
@@ -12,7 +13,7 @@ import traceback
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import dask
@@ -20,6 +21,7 @@ from distributed import Client, LocalCluster
 
 from romandask.model.errors import UserError
 from romandask.runtime.manifest import Record
+from romandask.runtime.order import Waiting
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.store import Store
 from romandask.runtime.work import Task, make_unit
@@ -57,11 +59,14 @@ class InProcess:
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; a failure is not tried again."""
-        for task in sorted(tasks, key=lambda task: (task.kin, task.index)):
+        waiting = Waiting([replace(task, cost=0.0) for task in tasks])
+        while waiting:
+            task = waiting.next()
             try:
                 yield Outcome(task.index, make_unit(product, task, store))
             except Exception:
                 yield Outcome(task.index, None, traceback.format_exc())
+                yield from _given_up(product, task.index, waiting)
 
 
 class OnCluster:
@@ -73,23 +78,30 @@ class OnCluster:
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; one that fails is tried up to three times."""
-        waiting = sorted(tasks, key=lambda task: (-task.cost, task.kin, task.index))[::-1]
+        waiting = Waiting(tasks)
         tries = {task.index: 0 for task in tasks}
         # the product goes to every worker once; a task carries only its number and its hash. It is the result of a
         # task, not scattered data: when the workers that hold it die the scheduler can make it again
         name = product.stage.replace("/", "-")
         token = uuid.uuid4().hex[:8]
         shared = self._client.submit(_itself, product, key=f"{name}-product-{token}")
+        flying: dict[int, Any] = {}
         futures: dict[Any, Task] = {}
+        missing = {task.index for task in tasks}
+        failed: set[int] = set()
+        number = itertools.count()
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
         def submit() -> None:
             room = WAVE * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
             while waiting and len(futures) < room:
-                task = waiting.pop()
+                task = waiting.next()
                 tries[task.index] += 1
-                key = f"{name}-{product.names[task.index]}-{token}-{tries[task.index]}"
-                future = self._client.submit(make_unit, shared, task, store, key=key, pure=False)
+                key = f"{name}-{product.names[task.index]}-{token}-{next(number)}"
+                # an edge of the graph for each unit that it comes after and that is not there yet
+                after = [flying[k] for k in task.after if k in flying]
+                future = self._client.submit(make_unit, shared, task, store, *after, key=key, pure=False)
+                flying[task.index] = future
                 futures[future] = task
                 future.add_done_callback(ended.put)
 
@@ -98,15 +110,22 @@ class OnCluster:
             while futures:
                 future = self._next(ended)
                 task = futures.pop(future)
+                del flying[task.index]
                 if future.status == "finished":
-                    outcome = Outcome(task.index, future.result())
+                    missing.discard(task.index)
+                    yield Outcome(task.index, future.result())
+                elif missing.intersection(task.after) and not failed.intersection(task.after):
+                    # it failed with one that it waited for, not by itself
+                    tries[task.index] -= 1
+                    waiting.again(task)
+                elif tries[task.index] < ATTEMPTS and not failed.intersection(task.after):
+                    waiting.again(task)
                 else:
-                    outcome = Outcome(task.index, None, _failure(future))
+                    yield Outcome(task.index, None, _failure(future))
+                    given_up = _given_up(product, task.index, waiting)
+                    failed |= {task.index, *(outcome.index for outcome in given_up)}
+                    yield from given_up
                 future.release()
-                if outcome.record is None and tries[task.index] < ATTEMPTS:
-                    waiting.append(task)
-                else:
-                    yield outcome
                 submit()
         finally:
             if futures:
@@ -128,6 +147,11 @@ class OnCluster:
                         f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
                         "(memory: raise run.memory_limit); the same command resumes"
                     ) from None
+
+
+def _given_up(product: ImageProduct | TableProduct, failed: int, waiting: Waiting) -> list[Outcome]:
+    text = f"{product.names[failed]}, which comes before it, failed\n"
+    return [Outcome(task.index, None, text) for task in waiting.give_up(failed)]
 
 
 def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:

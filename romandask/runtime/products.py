@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -43,7 +44,7 @@ class ImageProduct:
     stage: str
     """For example exposures/roman; also its place in the store."""
     units: Sequence[Unit]
-    make: Callable[[int], dict[str, np.ndarray]]
+    make: Callable[[int], dict[str, Any]]
     """Makes the arrays of one unit."""
     variables: tuple[Variable, ...]
     axes: tuple[str, ...]
@@ -58,6 +59,10 @@ class ImageProduct:
     seconds_per_unit: float = 0.0
     """Time, seconds of a core as measured on a laptop, of making one unit: for plans."""
     store: Store | None = None
+    stream: Callable[[int], Iterator[tuple[str, np.ndarray]]] | None = None
+    """Makes the arrays of one unit one after another, where all at once would not fit a worker."""
+    tables: dict[str, pa.Schema] = field(default_factory=dict)
+    """Tables that `make` returns beside the arrays of a unit, of any number of rows."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -67,6 +72,10 @@ class ImageProduct:
     def stored(self, store: Store) -> ImageProduct:
         """Return the same product, reading what the store has."""
         return replace(self, store=store)
+
+    def has(self, index: int) -> bool:
+        """True where the store has a unit."""
+        return self.store is not None and read_record(self.store, self.stage, self.names[index]) is not None
 
     def load(
         self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()
@@ -91,19 +100,34 @@ class ImageProduct:
 
     def write(self, index: int, store: Store) -> Made:
         """Make one unit and write it; no other unit shares its shards."""
+        if self.stream is not None:
+            return self._written(self.stream(index), index, store)
         arrays = self.make(index)
+        tables = [
+            write_parquet(table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name))
+            for name, kind in self.tables.items()
+        ]
+        return self._written(((v.name, arrays[v.name]) for v in self.variables), index, store, *tables)
+
+    def _written(self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, *tables: bytes) -> Made:
+        """Write the arrays of a unit, one after another."""
+        variables = {variable.name: variable for variable in self.variables}
+        hashes, size, rows = [], 0, 0
         group = zarr.open_group(store.images(self.stage), mode="r+")
         place = np.unravel_index(index, self.lengths)
-        for variable in self.variables:
-            array = arrays[variable.name]
+        for name, array in arrays:
+            variable = variables.pop(name)
             if array.shape != variable.shape or not np.isfinite(array).all():
                 raise ValueError(
                     f"{self.stage} {self.names[index]}: {variable.name} has shape {array.shape}, expected "
                     f"{variable.shape}, or values that are not finite"
                 )
             _array(group, variable.name)[place] = array.astype(variable.dtype, copy=False)
-        ordered = [arrays[variable.name] for variable in self.variables]
-        return Made(digest(*ordered), sum(array.nbytes for array in ordered), ordered[0].size)
+            hashes.append(digest(array))
+            size, rows = size + array.nbytes, max(rows, array.size)
+        if variables:
+            raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
+        return Made(digest(hashes, *tables), size, rows)
 
     @cached_property
     def dataset(self) -> xr.Dataset:
@@ -136,6 +160,11 @@ class ImageProduct:
             for key, (axes, values, attributes) in self.coordinates().items()
         }
         return xr.Dataset(data, coordinates, self.attributes)
+
+
+def table_beside(store: Store, stage: str, name: str, unit: str) -> Path:
+    """Return the file of a table that belongs to one unit of an image product."""
+    return store.table(f"{stage}_{name}", unit)
 
 
 def _array(group: zarr.Group, name: str) -> Any:

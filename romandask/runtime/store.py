@@ -37,6 +37,8 @@ class Variable:
     """Names of the axes of one unit."""
     attributes: dict[str, Any]
     """units, long_name, ..."""
+    compress: bool = True
+    """False where it would gain little and cost every reader time."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ def open_images(
                 array.update_attributes(variable.attributes)
                 continue
         ones = (1,) * len(lengths)
+        packing = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")] if variable.compress else []
         inner = tuple(_inner_chunk(length) for length in variable.shape)
         shard = tuple(-(-length // chunk) * chunk for length, chunk in zip(variable.shape, inner, strict=True))
         group.create_array(
@@ -167,7 +170,7 @@ def open_images(
             dtype=variable.dtype,
             chunks=ones + inner,
             shards=ones + shard,
-            compressors=[BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle"), Crc32cCodec()],
+            compressors=[*packing, Crc32cCodec()],
             fill_value=0,
             dimension_names=(*axes, *variable.axes),
             attributes=variable.attributes,

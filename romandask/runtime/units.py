@@ -19,6 +19,8 @@ class Unit:
     """(stage, unit) of the upstream units that it reads."""
     cost: float = 1.0
     """Relative time, so that long units go first."""
+    after: tuple[str, ...] = ()
+    """Units of the same stage that must be there before it; `settings` and `inputs` say what it takes from them."""
     kin: str = ""
     """Units of one kin are made one after another: what a worker keeps for the one it has for the next."""
 

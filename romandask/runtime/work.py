@@ -22,10 +22,15 @@ class Task:
     cost: float
     kin: str = ""
     """As that of its unit."""
+    after: tuple[int, ...] = ()
+    """Numbers of units of the same stage, made in the same run, that must be there before it."""
 
 
-def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store) -> Record:
-    """Make and write one unit, then its record: what a crash leaves in between is made again."""
+def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *after: Record) -> Record:
+    """Make and write one unit, then its record: what a crash leaves in between is made again.
+
+    `after` are records of units that it had to wait for: of a task graph's edges the values.
+    """
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")

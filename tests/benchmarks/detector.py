@@ -7,20 +7,27 @@ from __future__ import annotations
 
 import time
 import warnings
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import galsim
 import galsim.roman
 import numpy as np
 
+from romandask.calibration import calibrations
+from romandask.instruments.exposure import Exposure
+from romandask.instruments.roman import Roman, RomanSettings
+from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.kernels import sca
 from romandask.kernels.brighter_fatter import brighter_fatter
 from romandask.kernels.detector import Detector, observe
-from romandask.kernels.sca_exposure import Response, calibrate, expose
-from romandask.kernels.synthetic_sca import planes as made_up
+from romandask.kernels.sca_exposure import accumulate, calibrate, read_out
 from romandask.model.seeds import rng
+from romandask.readout import ScaReadout
+from romandask.runtime.manifest import Record, write_record
+from romandask.runtime.store import Store
 
 SEED = 20230992
-BLOCKS = ("BFE", "IPC", "GAIN")
 
 
 def seconds(work, repeat: int = 3) -> float:
@@ -37,22 +44,44 @@ def seconds(work, repeat: int = 3) -> float:
 def main() -> None:
     """Run the benchmark."""
     warnings.simplefilter("ignore")
-    values = dict(made_up(lambda name: rng(SEED, "calibration", 7, name)))
-    values |= {name: values[name].astype(np.float32) for name in ("CNL", "READ")}
+    with TemporaryDirectory() as folder:
+        run(Path(folder))
 
-    def planes(name: str, rows: slice) -> np.ndarray:
-        return values[name] if name in BLOCKS else values[name][..., rows, :]
 
-    response = Response(np.ones((64, 64), np.float32), np.ones((32, 32), np.float32), 139.8)
+def run(folder: Path) -> None:
+    """Time everything with the calibrations of one SCA in a store below a folder."""
+    store, source = Store(folder), CalibrationSource(None, SEED)
+    product = calibrations(source, [7])
+    product.prepare(store)
+    start = time.perf_counter()
+    product.write(0, store)
+    print(f"calibrations made {time.perf_counter() - start:6.2f} s  once an SCA")
+    write_record(store, Record(product.stage, product.names[0], "", "", 0, 0, 0.0, 0))
+    roman = Roman(RomanSettings(detector="sca"), 5, source)
+    readout = ScaReadout(roman, product.stored(store), SEED)
+    exposure = Exposure(1, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 0.0)
+    planes, response = readout.planes(exposure), readout.response(exposure)
     light = np.full((4088, 4088), 185.0, np.float32)
     light[::40, ::40] += 2e4
+
+    def of(step: str, block: int) -> np.random.Generator:
+        return rng(SEED, step, block)
+
+    def every_effect() -> None:
+        charge, _ = readout.charge(exposure, light)
+        readout.trapped(exposure, charge)
+        read_out(charge, planes, response, of)
+
     simple = seconds(lambda: observe(light, 0.0, Detector(1e5, 8.5), rng(SEED, "simple")))
-    full = seconds(lambda: expose(light, planes, response, lambda name, block: rng(SEED, name, block)))
-    numbers, _ = expose(light, planes, response, lambda name, block: rng(SEED, name, block))
+    full = seconds(every_effect)
+    numbers, _ = read_out(accumulate(light, planes, response, of), planes, response, of)
     back = seconds(lambda: calibrate(numbers, planes, response))
     print(f"simple model      {simple:6.2f} s")
-    print(f"every effect      {full:6.2f} s  {full / simple:.1f} times the simple model")
+    print(
+        f"every effect      {full:6.2f} s  {full / simple:.1f} times the simple model, calibrations read, traps found"
+    )
     print(f"calibrated again  {back:6.2f} s")
+    values = {name: planes(name, slice(None)) for name in ("IPC", "CNL", "PERSIST", "BFE")}
     image = galsim.ImageF(np.pad(light, 4))
     ours = {
         "IPC": lambda: sca.interpixel_capacitance(image.array, values["IPC"], 8),

@@ -1,0 +1,157 @@
+"""How an SCA turns light into an exposure, with the calibrations of its product and what earlier exposures left.
+
+Exposures of one SCA follow one another: charge that one leaves in traps comes out in those after it. What each leaves
+is written with it, a small table, and depends on nothing that was there before (of trapped charge a thousandth would be
+trapped again), so that an exposure needs those tables alone and none is drawn twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pandas as pd
+
+from romandask.calibration import MakeCalibration
+from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.roman import Roman
+from romandask.kernels.cosmic_rays import hits, tracks
+from romandask.kernels.sca import MEMORY, band_mean
+from romandask.kernels.sca_exposure import (
+    Planes,
+    Response,
+    Trapped,
+    accumulate,
+    afterglow,
+    calibrate,
+    read_out,
+    trap,
+)
+from romandask.kernels.synthetic_sca import SIDE, WAVES
+from romandask.model.seeds import rng
+from romandask.runtime.products import ImageProduct
+
+DAY = 86400.0
+"""Seconds."""
+
+
+def before(table: pd.DataFrame, index: int) -> np.ndarray:
+    """Return the rows of a pointings table whose afterglow is in the exposure of a row, in order of time.
+
+    They are those of the same detector that ended within MEMORY exposure times before it began.
+    """
+    start, exptime = table["mjd"].to_numpy(float) * DAY, table["exptime"].to_numpy(float)
+    gap = start[index] - start - exptime
+    same = table["detector"].to_numpy() == table["detector"].iat[index]
+    found = np.flatnonzero(same & (start < start[index]) & (gap <= MEMORY * exptime[index]))
+    return found[np.argsort(start[found], kind="stable")]
+
+
+def age(earlier: Exposure, later: Exposure) -> float:
+    """Return the seconds from the end of an exposure to the middle of a later one, a second in the least."""
+    return max((later.mjd - earlier.mjd) * DAY + later.exptime / 2 - earlier.exptime, 1.0)
+
+
+@dataclass(frozen=True)
+class ScaReadout:
+    """Reads out exposures with every effect of their SCA."""
+
+    instrument: Roman
+    calibration: ImageProduct
+    """What `calibrations()` returned."""
+    seed: int
+
+    def unit(self, exposure: Exposure) -> int:
+        """Return the number of an exposure's SCA in the calibrations."""
+        return self._maker.scas.index(exposure.detector)
+
+    def charge(self, exposure: Exposure, light: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return what light (electrons) leaves in the pixels, and what of it is cosmic rays' (both (4096, 4096))."""
+        rays = None
+        if self.instrument.settings.cosmic_rays:
+            found = tracks((SIDE, SIDE), exposure.exptime, self._random(exposure, "rays", 0))
+            rays = hits((SIDE, SIDE), found)
+        planes, response = self.planes(exposure), self.response(exposure)
+        return accumulate(light, planes, response, lambda *of: self._random(exposure, *of), rays), rays
+
+    def trapped(self, exposure: Exposure, charge: np.ndarray) -> pd.DataFrame:
+        """Return what stays of a charge (schema: catalogs/trapped.yaml)."""
+        return pd.DataFrame(vars(trap(charge, self.planes(exposure))))
+
+    def __call__(
+        self, exposure: Exposure, light: np.ndarray, left: Sequence[tuple[Exposure, pd.DataFrame]]
+    ) -> dict[str, np.ndarray | pd.DataFrame]:
+        """Return raw, image, variance, dq and the table of trapped charge of an exposure.
+
+        Parameters
+        ----------
+        light : (4088, 4088) expected electrons of objects, sky and thermal emission
+        left : exposures before it and what they left
+        """
+        charge, rays = self.charge(exposure, light)
+        planes, response = self.planes(exposure), self.response(exposure)
+        late = afterglow([
+            (Trapped(table["pixel"].to_numpy(), table["charge"].to_numpy()), age(earlier, exposure))
+            for earlier, table in left
+        ])  # fmt: skip
+        trapped = self.trapped(exposure, charge)
+        raw, dq = read_out(charge, planes, response, lambda *of: self._random(exposure, *of), late, rays)
+        del charge, rays, late
+        image, variance = calibrate(raw, planes, response)
+        return {"raw": raw, "image": image, "variance": variance, "dq": dq, "trapped": trapped}
+
+    def planes(self, exposure: Exposure) -> Planes:
+        """Return the calibrations of an exposure's SCA, some rows at a time."""
+        product, index = self.calibration, self.unit(exposure)
+        axes = {variable.name: variable.axes for variable in product.variables}
+        if not product.has(index):
+            whole = _made(self._maker, index)
+
+            def of_whole(name: str, rows: slice) -> np.ndarray:
+                return whole[name][..., rows, :] if axes[name][-1] == "x" else whole[name]
+
+            return of_whole
+
+        @lru_cache(maxsize=8)
+        def blocks(name: str) -> np.ndarray:
+            return product.load(index, (name,))[name]
+
+        def of_store(name: str, rows: slice) -> np.ndarray:
+            if axes[name][-1] != "x":
+                return blocks(name)
+            window = (*[slice(None)] * (len(axes[name]) - 2), rows)
+            return product.load(index, (name,), window)[name]
+
+        return of_store
+
+    def response(self, exposure: Exposure) -> Response:
+        """Return how an SCA answers the light of a band: means over its photons of a flat spectrum."""
+        band, planes = self.instrument.bandpass(exposure.band), self.planes(exposure)
+        efficiency, electrons = (
+            band_mean(planes(name, slice(None)), WAVES, band.wave, band.weights / band.wave).astype(np.float32)
+            for name in ("RELQE2", "QYIELD")
+        )
+        return Response(efficiency, electrons, exposure.exptime)
+
+    @property
+    def _maker(self) -> MakeCalibration:
+        maker = self.calibration.make
+        assert isinstance(maker, MakeCalibration)
+        return maker
+
+    def _random(self, exposure: Exposure, step: str, block: int) -> np.random.Generator:
+        name = self.instrument.name
+        return rng(self.seed, "exposures", name, exposure.visit, exposure.detector, step, block)
+
+
+@lru_cache(maxsize=1)
+def _made(maker: MakeCalibration, index: int) -> dict[str, np.ndarray]:
+    """Return the calibrations of an SCA that are not stored: long in the making, so kept until the next SCA's."""
+    return maker(index)
+
+
+def exposures_before(table: pd.DataFrame, index: int) -> list[tuple[int, Exposure]]:
+    """Return rows and exposures of those before one (`before`)."""
+    return [(int(row), exposure_of(table.iloc[int(row)])) for row in before(table, index)]

@@ -102,11 +102,15 @@ class RenderExposure:
         view = self.view(index)
         expected = self.expected(view)
         if self.readout is not None:
-            left = [(exposure, self.trapped(row)) for row, exposure in exposures_before(self.table, index)]
-            return {**self.readout(view.exposure, expected + view.background, left), "truth": expected}
+            light = expected + view.background
+            return {**self.readout(view.exposure, light, self.left(index)), "truth": expected}
         random = rng(self.seed, "exposures", self.instrument.name, view.exposure.visit, view.exposure.detector)
         image, dq = observe(expected, view.background, self.instrument.detector, random)
         return {"image": image, "truth": expected, "dq": dq}
+
+    def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
+        """Return the exposures before one whose afterglow it has, each with what it left in traps."""
+        return [(exposure, self.trapped(row)) for row, exposure in exposures_before(self.table, index)]
 
     def trapped(self, index: int) -> pd.DataFrame:
         """Return what an exposure left in traps: read where it is stored, worked out where not."""

@@ -53,6 +53,24 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     return _png(figure)
 
 
+def effects(images: dict[str, np.ndarray]) -> bytes:
+    """Return difference images (electrons), a panel an effect, each with its own scale."""
+    columns = 4
+    rows = -(-len(images) // columns)
+    figure = _figure(3.3 * columns, 3.1 * rows)
+    for position, (name, image) in enumerate(images.items()):
+        axes = figure.add_subplot(rows, columns, position + 1)
+        # what is everywhere decides the scale, or a tenth of the strongest where that is rare
+        strength = np.abs(image)
+        limit = max(float(np.percentile(strength, 99.5)), float(strength.max()) / 10, 1e-3)
+        shown = axes.imshow(image, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+        axes.set_title(name)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        figure.colorbar(shown, ax=axes, shrink=0.85)
+    return _png(figure)
+
+
 def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
     """Return weight and number of exposures of a tile in one band, by survey: (weight, nimages, band)."""
     figure = _figure(4.2 * 2 * len(tiles), 3.9)

@@ -54,6 +54,14 @@ def age(earlier: Exposure, later: Exposure) -> float:
     return max((later.mjd - earlier.mjd) * DAY + later.exptime / 2 - earlier.exptime, 1.0)
 
 
+def age_and_traps(exposure: Exposure, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> list[tuple[Trapped, float]]:
+    """Return what exposures before one left, each with its age (s) in the middle of that one."""
+    return [
+        (Trapped(table["pixel"].to_numpy(), table["charge"].to_numpy()), age(earlier, exposure))
+        for earlier, table in left
+    ]
+
+
 @dataclass(frozen=True)
 class ScaReadout:
     """Reads out exposures with every effect of their SCA."""
@@ -69,12 +77,15 @@ class ScaReadout:
 
     def charge(self, exposure: Exposure, light: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Return what light (electrons) leaves in the pixels, and what of it is cosmic rays' (both (4096, 4096))."""
-        rays = None
-        if self.instrument.settings.cosmic_rays:
-            found = tracks((SIDE, SIDE), exposure.exptime, self._random(exposure, "rays", 0))
-            rays = hits((SIDE, SIDE), found)
+        rays = self.rays(exposure)
         planes, response = self.planes(exposure), self.response(exposure)
-        return accumulate(light, planes, response, lambda *of: self._random(exposure, *of), rays), rays
+        return accumulate(light, planes, response, lambda *of: self.random(exposure, *of), rays), rays
+
+    def rays(self, exposure: Exposure) -> np.ndarray | None:
+        """Return the electrons (4096, 4096) of cosmic rays; None where there are to be none."""
+        if not self.instrument.settings.cosmic_rays:
+            return None
+        return hits((SIDE, SIDE), tracks((SIDE, SIDE), exposure.exptime, self.random(exposure, "rays", 0)))
 
     def trapped(self, exposure: Exposure, charge: np.ndarray) -> pd.DataFrame:
         """Return what stays of a charge (schema: catalogs/trapped.yaml)."""
@@ -92,12 +103,9 @@ class ScaReadout:
         """
         charge, rays = self.charge(exposure, light)
         planes, response = self.planes(exposure), self.response(exposure)
-        late = afterglow([
-            (Trapped(table["pixel"].to_numpy(), table["charge"].to_numpy()), age(earlier, exposure))
-            for earlier, table in left
-        ])  # fmt: skip
+        late = afterglow(age_and_traps(exposure, left))
         trapped = self.trapped(exposure, charge)
-        raw, dq = read_out(charge, planes, response, lambda *of: self._random(exposure, *of), late, rays)
+        raw, dq = read_out(charge, planes, response, lambda *of: self.random(exposure, *of), late, rays)
         del charge, rays, late
         image, variance = calibrate(raw, planes, response)
         return {"raw": raw, "image": image, "variance": variance, "dq": dq, "trapped": trapped}
@@ -141,7 +149,8 @@ class ScaReadout:
         assert isinstance(maker, MakeCalibration)
         return maker
 
-    def _random(self, exposure: Exposure, step: str, block: int) -> np.random.Generator:
+    def random(self, exposure: Exposure, step: str, block: int) -> np.random.Generator:
+        """Return the random generator of a step and block of rows of an exposure."""
         name = self.instrument.name
         return rng(self.seed, "exposures", name, exposure.visit, exposure.detector, step, block)
 

@@ -10,8 +10,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from romandask import pictures
+from romandask.effects import differences
 from romandask.flow import Planned, run_figures, stored_versions
 from romandask.pointings import corners_of
+from romandask.readout import before
 from romandask.survey import Survey
 
 STYLE = """
@@ -32,6 +34,7 @@ def write_report(survey: Survey) -> Path:
         _overview(survey, objects),
         _inputs(survey),
         _sky(survey, objects, busiest),
+        _detector(survey),
         _measurements(survey, objects),
         _blends(survey),
         _figures_of_the_run(survey),
@@ -114,6 +117,21 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
             f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
         )
         + _image(pictures.maps(layers), "Weight and number of exposures of the tile.")
+    )
+
+
+def _detector(survey: Survey) -> str:
+    """Return what each effect of the detectors does, where they are modelled in full."""
+    if survey.pipeline.calibration() is None:
+        return ""
+    product, table = survey.exposure_product("roman"), survey.pointings("roman")
+    # one that has an afterglow, if there is one
+    index = next((row for row in range(len(table)) if len(before(table, row))), 0)
+    name = product.names[index]
+    return "<h2>The detectors</h2>" + _image(
+        pictures.effects({found.effect: found.image for found in differences(product, index)}),
+        f"What each effect of the SCA does around the brightest star of exposure {name}: with it less without it, all "
+        "else and the random numbers the same, in electrons.",
     )
 
 

@@ -17,7 +17,7 @@ LAYERS = [
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
-    {"matches", "detections", "cutouts"},
+    {"matches", "detections", "cutouts", "effects"},
     {"coadds"},
     {"truth_index", "psfs"},
     {"exposures"},

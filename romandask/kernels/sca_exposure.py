@@ -93,7 +93,7 @@ def accumulate(
     for block, rows in enumerate(_blocks()):
         mean = _padded(light, rows)
         mean = quantum_efficiency(mean, planes("RELQE1", rows), expand(response.efficiency, 64, rows))
-        mean = count_rate_nonlinearity(mean, planes("CRNL", rows)[0], response.exptime)
+        mean = count_rate_nonlinearity(mean, planes("CRNL", rows)[0].astype(np.float32), response.exptime)
         caught = generators("light", block).poisson(np.maximum(mean, 0))
         charge[rows] = quantum_yield(caught, expand(response.electrons, 128, rows), generators("yield", block))
     if rays is not None:
@@ -114,7 +114,9 @@ def trap(charge: np.ndarray, planes: Planes) -> Trapped:
             :, BORDER : SIDE - BORDER
         ])  # fmt: skip
         y, x = np.nonzero(here > STIMULI[0] / 2)
-        released = persistence(here[y, x], planes("PERSIST", slice(first, last))[:, y, x + BORDER], 1.0)
+        released = persistence(
+            here[y, x], planes("PERSIST", slice(first, last))[:, y, x + BORDER].astype(np.float32), 1.0
+        )
         kept = released >= LEAST
         pixel = (y[kept] + first - BORDER) * (SIDE - 2 * BORDER) + x[kept]
         found.append((pixel.astype(np.int32), released[kept].astype(np.float32)))
@@ -153,7 +155,7 @@ def read_out(
         dq[rays > JUMP] |= COSMIC_RAY_FLAG
     signal = np.empty((SIDE, SIDE), np.float32)
     for block, rows in enumerate(_blocks()):
-        dark = planes("DARK", rows) * np.float32(response.exptime)
+        dark = planes("DARK", rows).astype(np.float32) * np.float32(response.exptime)
         if late is not None:
             added = _padded(late, rows) * np.float32(response.exptime)
             # what is more than the noise of the sky's own electrons in the least
@@ -171,7 +173,7 @@ def read_out(
         for bit, flag in _OF_PIXELS:
             dq[rows][bits & bit > 0] |= flag
         noise = generators("read", block).standard_normal(here.shape, np.float32)
-        here += noise * planes("READ", rows)
+        here += noise * planes("READ", rows).astype(np.float32)
         numbers[rows] = digitise(here, expand(planes("GAIN", slice(None)), 128, rows), planes("BIAS", rows))
     return numbers[inner, inner], dq[inner, inner]
 
@@ -198,17 +200,19 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
     variance = np.empty((SIDE, SIDE), np.float32)
     for rows in _blocks():
         electrons = linear(signal[rows], planes("CNL", rows), 3)
-        dark = planes("DARK", rows) * np.float32(response.exptime)
+        dark = planes("DARK", rows).astype(np.float32) * np.float32(response.exptime)
         relative = planes("RELQE1", rows) * expand(response.efficiency, 64, rows)
         relative = relative * expand(response.electrons, 128, rows)
         gain = expand(planes("GAIN", slice(None)), 128, rows)
         # noise that was added after the signal had spread grows with its inverse, by the sum of its squares
         middle = expand(kernels[1, 1], 8, rows)
         grown = 1 / middle**2 * (1 + (1 - middle) ** 2 / 4 / middle**2)
-        read = planes("READ", rows) ** 2 + gain**2 / 12
+        read = planes("READ", rows).astype(np.float32) ** 2 + gain**2 / 12
         lit = relative > 0
         safe = np.where(lit, relative, 1)
-        light = count_rate_linearity((electrons - dark) / safe, planes("CRNL", rows)[0], response.exptime)
+        light = count_rate_linearity(
+            (electrons - dark) / safe, planes("CRNL", rows)[0].astype(np.float32), response.exptime
+        )
         variance[rows] = np.where(lit, (np.maximum(electrons, 0) + read * grown) / safe**2, 0)
         signal[rows] = np.where(lit, light, 0)
     return signal[inner, inner], variance[inner, inner]
@@ -217,24 +221,29 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
 def poisson(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return Poisson numbers (float32) of mostly small means, by inversion of uniform ones."""
     uniform = rng.random(mean.shape, np.float32)
-    found = _invert(np.ascontiguousarray(mean, np.float32).ravel(), uniform.ravel()).reshape(mean.shape)
+    mean = np.ascontiguousarray(mean, np.float32)
+    found = _invert(mean.ravel(), np.exp(-mean).ravel(), uniform.ravel()).reshape(mean.shape)
     large = mean > _SMALL
     found[large] = rng.poisson(mean[large])
     return found
 
 
 @numba.njit(nogil=True, cache=True)
-def _invert(mean, uniform):
+def _invert(mean, none, uniform):
+    """Return the numbers whose cumulative probability passes `uniform`; `none` is the probability of none."""
+    over = np.zeros(101, np.float32)
+    for k in range(1, 101):
+        over[k] = 1 / k
     out = np.zeros(mean.shape[0], np.float32)
     for i in range(mean.shape[0]):
         if mean[i] <= 0 or mean[i] > _SMALL:
             continue
-        share = np.exp(-np.float64(mean[i]))
-        below, k = share, 0
-        while uniform[i] > below and k < 100:
+        share = none[i]
+        left, k = uniform[i] - share, 0
+        while left > 0 and k < 100:
             k += 1
-            share *= mean[i] / k
-            below += share
+            share *= mean[i] * over[k]
+            left -= share
         out[i] = k
     return out
 

@@ -45,16 +45,31 @@ def write_record(store: Store, record: Record) -> None:
     write_json(store.record(record.stage, record.unit), asdict(record))
 
 
-def digest(*parts: Any) -> str:
-    """Return a hash of values: mappings and sequences by their sorted JSON, arrays and bytes by their content."""
-    state = hashlib.blake2b(digest_size=16)
-    for part in parts:
+class Digest:
+    """A hash of values that come one after another."""
+
+    def __init__(self) -> None:
+        self._state = hashlib.blake2b(digest_size=16)
+
+    def add(self, part: Any) -> None:
+        """Add mappings and sequences by their sorted JSON, arrays and bytes by their content."""
         if isinstance(part, bytes):
-            state.update(part)
+            self._state.update(part)
         elif isinstance(part, np.ndarray):
-            state.update(f"{part.dtype.str}{part.shape}".encode())
-            state.update(np.ascontiguousarray(part).data)
+            self._state.update(f"{part.dtype.str}{part.shape}".encode())
+            self._state.update(np.ascontiguousarray(part).data)
         else:
-            state.update(json.dumps(part, sort_keys=True, default=str).encode())
-        state.update(b"\0")
-    return state.hexdigest()
+            self._state.update(json.dumps(part, sort_keys=True, default=str).encode())
+        self._state.update(b"\0")
+
+    def value(self) -> str:
+        """Return the hash of what was added."""
+        return self._state.hexdigest()
+
+
+def digest(*parts: Any) -> str:
+    """Return a hash of values (see Digest)."""
+    state = Digest()
+    for part in parts:
+        state.add(part)
+    return state.value()

@@ -19,7 +19,7 @@ import zarr
 
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
-from romandask.runtime.manifest import digest, read_record
+from romandask.runtime.manifest import Digest, digest, read_record
 from romandask.runtime.store import Store, Variable, open_images, read_parquet, write_coordinate, write_parquet
 from romandask.runtime.units import Unit, names_of
 
@@ -112,7 +112,7 @@ class ImageProduct:
     def _written(self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, *tables: bytes) -> Made:
         """Write the arrays of a unit, one after another."""
         variables = {variable.name: variable for variable in self.variables}
-        hashes, size, rows = [], 0, 0
+        state, size, rows = Digest(), 0, 0
         group = zarr.open_group(store.images(self.stage), mode="r+")
         place = np.unravel_index(index, self.lengths)
         for name, array in arrays:
@@ -123,11 +123,13 @@ class ImageProduct:
                     f"{variable.shape}, or values that are not finite"
                 )
             _array(group, variable.name)[place] = array.astype(variable.dtype, copy=False)
-            hashes.append(digest(array))
+            state.add(array)
             size, rows = size + array.nbytes, max(rows, array.size)
         if variables:
             raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
-        return Made(digest(hashes, *tables), size, rows)
+        for table in tables:
+            state.add(table)
+        return Made(state.value(), size, rows)
 
     @cached_property
     def dataset(self) -> xr.Dataset:

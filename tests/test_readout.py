@@ -25,7 +25,8 @@ from romandask.runtime.work import Task
 from romandask.survey import open_survey
 
 FULL = (
-    *(text for text in MINI if not text.startswith("rubin")), "rubin=null", "roman.detector=sca", "roman.cosmic_rays=true",
+    *(text for text in MINI if not text.startswith("rubin")), "rubin=null",
+    "roman.detector=sca", "roman.cosmic_rays=true",
 )  # fmt: skip
 
 

@@ -35,6 +35,8 @@ from romandask.runtime.products import ImageProduct
 
 DAY = 86400.0
 """Seconds."""
+_STORED = 1024
+"""Rows of a stored chunk."""
 
 
 def before(table: pd.DataFrame, index: int) -> np.ndarray:
@@ -122,15 +124,23 @@ class ScaReadout:
 
             return of_whole
 
-        @lru_cache(maxsize=8)
-        def blocks(name: str) -> np.ndarray:
-            return product.load(index, (name,))[name]
+        # what is asked for a few rows at a time, in their order, is read as it is stored
+        last: dict[str, tuple[int, np.ndarray]] = {}
 
         def of_store(name: str, rows: slice) -> np.ndarray:
             if axes[name][-1] != "x":
-                return blocks(name)
-            window = (*[slice(None)] * (len(axes[name]) - 2), rows)
-            return product.load(index, (name,), window)[name]
+                if name not in last:
+                    last[name] = 0, product.load(index, (name,))[name]
+                return last[name][1]
+            if rows == slice(None) or rows.start // _STORED != (rows.stop - 1) // _STORED:
+                return product.load(index, (name,), (*[slice(None)] * (len(axes[name]) - 2), rows))[name]
+            part = rows.start // _STORED
+            if name not in last or last[name][0] != part:
+                last.pop(name, None)
+                window = (*[slice(None)] * (len(axes[name]) - 2), slice(part * _STORED, (part + 1) * _STORED))
+                last[name] = part, product.load(index, (name,), window)[name]
+            first = part * _STORED
+            return last[name][1][..., rows.start - first : rows.stop - first, :]
 
         return of_store
 

@@ -43,8 +43,8 @@ _OF_PIXELS = (
     (DISCONNECTED, DISCONNECTED_FLAG), (HOT, HOT_FLAG), (ADJACENT, ADJACENT_FLAG),
     (LOW_EFFICIENCY, LOW_EFFICIENCY_FLAG), (NOISY, NOISY_FLAG),
 )  # fmt: skip
-_ROWS = 1024
-"""Rows that share a random generator."""
+_ROWS = 32
+"""Rows that share a random generator, and are worked on while they are in the processor's cache."""
 _SMALL = 20.0
 """Expected electrons up to which Poisson numbers are found by inversion."""
 

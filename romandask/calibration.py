@@ -13,9 +13,8 @@ from romandask.formats.calibration import check, path_of, write
 from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.roman_focal_plane import SCAS
 from romandask.kernels.sca import STIMULI
-from romandask.kernels.synthetic_sca import WAVES, planes
+from romandask.kernels.synthetic_sca import WAVES
 from romandask.model.errors import UserError
-from romandask.model.seeds import rng
 from romandask.runtime.products import Coordinates, ImageProduct
 from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
@@ -47,7 +46,7 @@ def make_files(folder: Path, seed: int, scas: Sequence[int] = SCAS) -> Iterator[
         )
     for sca in scas:
         path = path_of(folder, sca)
-        write(path, sca, planes(lambda name, sca=sca: rng(seed, "calibration", sca, name)), f"made up, seed {seed}")
+        write(path, sca, CalibrationSource(None, seed).planes(sca), f"made up, seed {seed}")
         yield path
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -53,12 +54,8 @@ def differences(exposures: ImageProduct, index: int, side: int = 96) -> list[Dif
     square = _square(truth, side)
     planes, response = readout.planes(exposure), readout.response(exposure)
     late = afterglow(age_and_traps(exposure, maker.left(index)))
-    rays = readout.rays(exposure)
-
-    def of(step: str, block: int) -> np.random.Generator:
-        return readout.random(exposure, step, block)
-
-    charge = accumulate(light, planes, response, of, rays)
+    of = partial(readout.random, exposure)
+    charge, rays = readout.charge(exposure, light)
     whole = _electrons(read_out(charge, planes, response, of, late, rays)[0], planes, square)
 
     def without(changed: Planes, kept: np.ndarray | None = None, glow: np.ndarray | None = late) -> np.ndarray:

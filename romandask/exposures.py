@@ -26,7 +26,7 @@ from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
-from romandask.readout import ScaReadout, before, exposures_before
+from romandask.readout import ScaReadout, before
 from romandask.runtime.manifest import read_record
 from romandask.runtime.products import Coordinates, ImageProduct, table_beside, to_frame
 from romandask.runtime.schemas import schema
@@ -110,7 +110,7 @@ class RenderExposure:
 
     def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
         """Return the exposures before one whose afterglow it has, each with what it left in traps."""
-        return [(exposure, self.trapped(row)) for row, exposure in exposures_before(self.table, index)]
+        return [(exposure_of(self.table.iloc[row]), self.trapped(row)) for row in before(self.table, index).tolist()]
 
     def trapped(self, index: int) -> pd.DataFrame:
         """Return what an exposure left in traps: read where it is stored, worked out where not."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pandas as pd
 
 from romandask.calibration import MakeCalibration
-from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman import Roman
 from romandask.kernels.cosmic_rays import hits, tracks
 from romandask.kernels.sca import MEMORY, band_mean
@@ -81,7 +81,7 @@ class ScaReadout:
         """Return what light (electrons) leaves in the pixels, and what of it is cosmic rays' (both (4096, 4096))."""
         rays = self.rays(exposure)
         planes, response = self.planes(exposure), self.response(exposure)
-        return accumulate(light, planes, response, lambda *of: self.random(exposure, *of), rays), rays
+        return accumulate(light, planes, response, partial(self.random, exposure), rays), rays
 
     def rays(self, exposure: Exposure) -> np.ndarray | None:
         """Return the electrons (4096, 4096) of cosmic rays; None where there are to be none."""
@@ -107,7 +107,7 @@ class ScaReadout:
         planes, response = self.planes(exposure), self.response(exposure)
         late = afterglow(age_and_traps(exposure, left))
         trapped = self.trapped(exposure, charge)
-        raw, dq = read_out(charge, planes, response, lambda *of: self.random(exposure, *of), late, rays)
+        raw, dq = read_out(charge, planes, response, partial(self.random, exposure), late, rays)
         del charge, rays, late
         image, variance = calibrate(raw, planes, response)
         return {"raw": raw, "image": image, "variance": variance, "dq": dq, "trapped": trapped}
@@ -169,8 +169,3 @@ class ScaReadout:
 def _made(maker: MakeCalibration, index: int) -> dict[str, np.ndarray]:
     """Return the calibrations of an SCA that are not stored: long in the making, so kept until the next SCA's."""
     return maker(index)
-
-
-def exposures_before(table: pd.DataFrame, index: int) -> list[tuple[int, Exposure]]:
-    """Return rows and exposures of those before one (`before`)."""
-    return [(int(row), exposure_of(table.iloc[int(row)])) for row in before(table, index)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class CalibrationSource:
     def planes(self, sca: int) -> Iterator[tuple[str, np.ndarray]]:
         """Yield names and values of the calibrations of an SCA, in the order of the paper's table 1."""
         if self.folder is None:
-            yield from planes(lambda name: rng(self.seed, "calibration", sca, name))
+            yield from planes(partial(rng, self.seed, "calibration", sca))
             return
         for extension in TABLE:
             if extension.dtype and not extension.name.endswith("FLAT"):
@@ -75,7 +75,7 @@ class CalibrationSource:
 @lru_cache(maxsize=18)
 def _diffusion(source: CalibrationSource, sca: int) -> float:
     if source.folder is None:
-        covariance = charge_diffusion(lambda name: rng(source.seed, "calibration", sca, name))
+        covariance = charge_diffusion(partial(rng, source.seed, "calibration", sca))
     else:
         covariance = read(path_of(source.folder, sca), "CHRGDIFF")
     return float(np.sqrt(covariance[:2].mean()))

@@ -82,7 +82,7 @@ class ImageProduct:
     ) -> dict[str, np.ndarray]:
         """Return the arrays of a unit, or a window of them: read where the manifest has it, made where not."""
         wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
-        if self.store is not None and read_record(self.store, self.stage, self.names[index]):
+        if self.store is not None and self.has(index):
             group = zarr.open_group(self.store.images(self.stage), mode="r")
             place = np.unravel_index(index, self.lengths)
             return {name: _array(group, name)[(*place, *window)] for name in wanted}

@@ -5,7 +5,7 @@ Roman's are drizzled from its exposures, one at a time; Rubin's are drawn direct
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +14,13 @@ import pandas as pd
 import sep
 from astropy.wcs import WCS
 
+from romandask.coadd_psfs import input_psf, psf_side
 from romandask.exposures import RenderExposure, cone, empty_variance, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.detector import noise_realisation, usable
-from romandask.kernels.drizzle import Strip, Sums, pixel_map, strips
+from romandask.kernels.drizzle import Sums
 from romandask.kernels.fourier import POINT
+from romandask.kernels.pixel_map import PixelMap, Strip, pixel_map, strips
 from romandask.kernels.psf import PsfModel
 from romandask.kernels.render import Scene, draw, draw_wide, plan_stamps
 from romandask.kernels.scene import build_scene
@@ -27,18 +29,15 @@ from romandask.model.config import CoaddSettings, RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import touching_pairs
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
-from romandask.model.tiles import Tile, tangent_header
+from romandask.model.tiles import Tile
 from romandask.pointings import corners_of
 from romandask.psfs import flat_shares
 from romandask.runtime.manifest import digest
 from romandask.runtime.products import Coordinates, ImageProduct
+from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
 from romandask.runtime.units import LazyUnits, Unit
 
-PSF_RADIUS = 3.0
-"""Half the side of the PSF images, arcsec, for a pixel of 0.0575 arcsec; larger pixels get larger images."""
-PSF_PHASES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-"""Where in a native pixel the stars of the PSF image lie: undersampled, an image of a star depends on it."""
 BACKGROUND_MESH = 256
 """Pixels of the mesh on which an exposure's background is estimated."""
 
@@ -89,21 +88,24 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
             "header": (("tile",), np.array(headers, object), text),
         }
 
+    planes = 2 + settings.noise
     mean = np.mean([len(chosen) for chosen in members.values()])
     return ImageProduct(
         f"coadds/{instrument.name}",
         LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
         maker,
-        _planes(pixels, psf_side(instrument), "1/nJy2" if drawn else "s"),
+        _planes(pixels, settings.noise, psf_side(instrument), None if drawn else most_inputs(members)),
         ("tile", "band"),
         (len(tiles), len(instrument.bands)),
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        bytes_per_unit=pixels**2 * (48 if drawn else 33)
-        + int(np.prod(instrument.shape)) * (0 if drawn else 22)
-        + (550 << 20),
+        # sums, sets and what is written at a time; the exposure that is added, its noise and its light
+        bytes_per_unit=pixels**2 * ((44 if drawn else 8) + 4 * planes)
+        + (0 if drawn else max(int(np.prod(instrument.shape)) * 22, pixels**2 * 4))
+        + (350 << 20),
         # a drizzled exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 6e-8 * float(mean)),
+        tables={"sets": schema("sets")},
     )
 
 
@@ -118,12 +120,6 @@ def _members(table: pd.DataFrame, tiles: np.ndarray, bands: tuple[str, ...]) -> 
     return {(k // len(bands), bands[k % len(bands)]): part for k, part in enumerate(parts)}
 
 
-def psf_side(instrument: Instrument) -> int:
-    """Return the side of the PSF images of an instrument's coadds, pixels, odd."""
-    radius = PSF_RADIUS * max(1.0, instrument.coadd_scale / 0.1)
-    return 2 * int(round(radius / instrument.coadd_scale)) + 1
-
-
 @dataclass(frozen=True)
 class DrizzleTile:
     """Makes one tile and band by drizzling its exposures."""
@@ -136,33 +132,73 @@ class DrizzleTile:
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages and psf."""
+        """Return image, weight, noise, nimages, set, PSFs and the table of sets."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument = source.instrument
         k, b = divmod(index, len(instrument.bands))
         tile, band = self.tiles[k], instrument.bands[b]
         scale = instrument.coadd_scale
         target = WCS(tile.header(self.pixels, scale))
+        members = self.members[k, band]
+        sums = Sums((self.pixels, self.pixels), 1 + self.settings.noise, self.settings.pixfrac)
         side = psf_side(instrument)
-        sums = Sums((self.pixels, self.pixels), 2, self.settings.pixfrac)
-        psf = Sums((side, side), 1, self.settings.pixfrac)
-        for i in self.members[k, band]:
+        psfs = np.zeros((most_inputs(self.members), side, side), np.float32)
+        for number, i in enumerate(members):
             exposure = exposure_of(source.table.iloc[i])
             header = instrument.header(exposure)
             wcs = WCS(header)
             parts = strips(wcs, instrument.shape, target, (self.pixels, self.pixels))
+            planes: Iterable = []
             if parts:
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
-                sums.add(_planes_of(arrays, parts, instrument, exposure, header, target, source.seed))
-                _add_star(psf, instrument, exposure, wcs, tile, side)
-        area = np.float32(scale**2)
+                planes = _planes_of(
+                    arrays, parts, instrument, exposure, header, target, source.seed, self.settings.noise
+                )
+                psfs[number] = input_psf(instrument, exposure, wcs, tile.ra, tile.dec, self.settings.pixfrac)
+            sums.add(planes)
+        seconds = source.table.iloc[members]["exptime"].to_numpy(float)
+        sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])
+        count = sums.count
+        image, *noise = sums.means()
+        for plane in (image, *noise):
+            plane *= np.float32(scale**2)
+        used = np.bincount(sets["input"], sets["seconds"] * sets["pixels"], len(psfs))
         return {
-            "image": sums.image(0) * area,
+            "image": image,
             "weight": sums.weight,
-            "noise": sums.image(1) * area,
-            "nimages": sums.count,
-            "psf": psf.image(0) * area,
+            "noise": np.stack(noise) if len(noise) > 1 else noise[0][None],
+            "nimages": count,
+            "set": sums.set,
+            "psf": np.tensordot(used / max(used.sum(), 1e-30), psfs, 1).astype(np.float32),
+            "input_psf": psfs,
+            "sets": sets,
         }
+
+
+def most_inputs(members: dict[tuple[int, str], np.ndarray]) -> int:
+    """Return the most exposures that any tile has in any band, one at least."""
+    return max(1, *(len(chosen) for chosen in members.values()))
+
+
+def sets_table(
+    planes: np.ndarray, members: list[tuple[int, ...]], seconds: np.ndarray, names: list[str]
+) -> pd.DataFrame:
+    """Return the sets of exposures of a tile, one row for each exposure of each (schema: catalogs/sets.yaml).
+
+    Parameters
+    ----------
+    planes : (ny, nx) number of the set of each pixel
+    members : exposures of each set, as numbers
+    seconds, names : of each exposure
+    """
+    pixels = np.bincount(planes.ravel(), minlength=len(members))
+    rows = [(k, number) for k, chosen in enumerate(members) if pixels[k] for number in chosen]
+    sets, inputs = np.array(rows, int).reshape(-1, 2).T
+    return pd.DataFrame({
+        "set": sets.astype(np.int32), "input": inputs.astype(np.int32),
+        "exposure": np.array([*names, ""], object)[inputs],
+        "seconds": np.array([*seconds, 0], np.float32)[inputs], "pixels": pixels[sets],
+    })  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -177,7 +213,7 @@ class DrawTile:
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages and psf."""
+        """Return image, weight, noise, nimages, set, PSFs and the table of sets."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument: Any = source.instrument
         k, b = divmod(index, len(instrument.bands))
@@ -192,16 +228,17 @@ class DrawTile:
         corners = corners_of(source.table.iloc[self.members[k, band]])
         polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
         layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
+        chosen_names = [self.exposures.names[i] for i in self.members[k, band]]
+        exptimes = np.array([exposure.exptime for exposure in chosen])
+        made = {
+            "weight": layers.weight, "nimages": layers.count, "set": layers.set,
+            "sets": sets_table(layers.set, layers.sets, exptimes, chosen_names),
+        }  # fmt: skip
+        realisations = self.settings.noise
         if not layers.shares.any():
             side = psf_side(instrument)
-            blank = np.zeros(shape, np.float32)
-            return {
-                "image": blank,
-                "weight": blank,
-                "noise": blank,
-                "nimages": layers.count,
-                "psf": np.zeros((side, side)),
-            }
+            blank = np.zeros((realisations, *shape), np.float32)
+            return {**made, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
         truth = source.truth.near(*cone(tile.corners(self.settings.grid().side)))
         scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
@@ -211,16 +248,22 @@ class DrawTile:
         expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
         empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
         light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
-        other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band).standard_normal(
-            shape, dtype=np.float32
-        )
+        noise = np.empty((realisations, *shape), np.float32)
+        for number, plane in enumerate(noise):
+            other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band, *_number(number))
+            other.standard_normal(out=plane, dtype=np.float32)
+            plane *= np.sqrt(empty)
         return {
+            **made,
             "image": expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0)),
-            "weight": layers.weight,
-            "noise": other * np.sqrt(empty),
-            "nimages": layers.count,
+            "noise": noise,
             "psf": _star(psf, bandpass, psf_side(instrument)),
         }
+
+
+def _number(realisation: int) -> tuple[int, ...]:
+    """Return what tells the random numbers of a noise realisation from those of the first."""
+    return (realisation,) if realisation else ()
 
 
 def _planes_of(
@@ -231,8 +274,9 @@ def _planes_of(
     header: dict,
     target: WCS,
     seed: int,
-) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
-    """Yield, for each strip, image and noise realisation in nJy/arcsec2, weight and map onto the tile."""
+    realisations: int,
+) -> Iterator[tuple[list[np.ndarray], np.ndarray, PixelMap]]:
+    """Yield, for each strip, image and noise realisations in nJy/arcsec2, weight and map onto the tile."""
     good = usable(arrays["dq"])
     light = subtract_background(arrays["image"], ~good)
     to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
@@ -242,12 +286,16 @@ def _planes_of(
         here = (part.rows, part.columns)
         scale = to_njy / pixel_areas(header, instrument.shape, *here)
         background = instrument.background(exposure, header, *here)
-        noise = noise_realisation(
-            empty_variance(arrays, background, instrument.detector, here), instrument.shape[1], *here,
-            lambda block: rng(seed, "coadds", *identity, block),
-        )  # fmt: skip
+        variance = empty_variance(arrays, background, instrument.detector, here)
+        noise = [
+            noise_realisation(
+                variance, instrument.shape[1], *here,
+                lambda block, k=number: rng(seed, "coadds", *identity, *_number(k), block),
+            )
+            for number in range(realisations)
+        ]  # fmt: skip
         weight = np.float32(exposure.exptime) * good[here]
-        yield [light[here] * scale, noise * scale], weight, pixel_map(wcs, target, *here)
+        yield [light[here] * scale, *(plane * scale for plane in noise)], weight, pixel_map(wcs, target, *here)
 
 
 def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -282,44 +330,22 @@ def _star(
     return image
 
 
-def _add_star(psf: Sums, instrument: Instrument, exposure: Exposure, wcs: WCS, tile: Tile, side: int) -> None:
-    """Drizzle unit stars, as the exposure sees them as near as it can to the tile's centre, onto the PSF image."""
-    ny, nx = instrument.shape
-    at = np.array(wcs.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float)
-    # a stamp at any roll covers the corners of the PSF image
-    half = int(np.ceil(1.5 * side * instrument.coadd_scale / instrument.pixel_scale / 2)) + 2
-    column, row = np.rint(np.clip(at, half + 1, [nx - half - 2, ny - half - 2])).astype(int)
-    rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-    model, bandpass = instrument.psf_at(exposure, column, row), instrument.bandpass(exposure.band)
-    area = pixel_areas_at(wcs, float(column), float(row))
-    for offset in PSF_PHASES:
-        star = _star(model, bandpass, 2 * half + 1, offset)
-        ra, dec = wcs.all_pix2world(column + offset[0], row + offset[1], 0)
-        target = WCS(tangent_header(float(ra), float(dec), side, instrument.coadd_scale))
-        weight = np.full(star.shape, exposure.exptime, np.float32)
-        psf.add([([(star / area).astype(np.float32)], weight, pixel_map(wcs, target, rows, columns))])
-
-
-def pixel_areas_at(wcs: WCS, x: float, y: float) -> float:
-    """Return the area, arcsec2, of the pixel at a position."""
-    ra, dec = wcs.all_pix2world([x + 0.5, x - 0.5, x, x], [y, y, y + 0.5, y - 0.5], 0)
-    east = ((ra[[0, 2]] - ra[[1, 3]] + 180) % 360 - 180) * np.cos(np.radians(dec.mean()))
-    north = dec[[0, 2]] - dec[[1, 3]]
-    return float(abs(east[0] * north[1] - east[1] * north[0]) * 3600**2)
-
-
-def _planes(pixels: int, psf: int, weight_unit: str) -> tuple[Variable, ...]:
+def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Variable, ...]:
+    """Return the arrays of a tile: `inputs` exposures at most are drizzled, or None where tiles are drawn."""
     shape, axes = (pixels, pixels), ("y", "x")
-    return (
+    text = "noise realisations with the image's correlations"
+    found = [
         Variable("image", "float32", shape, axes, {"units": "nJy", "long_name": "flux of a pixel"}),
-        Variable("weight", "float32", shape, axes, {"units": weight_unit, "long_name": "sum of weights"}),
         Variable(
-            "noise",
-            "float32",
-            shape,
-            axes,
-            {"units": "nJy", "long_name": "noise realisation with the image's correlations"},
+            "weight", "float32", shape, axes,
+            {"units": "s" if inputs else "1/nJy2", "long_name": "sum of weights"},
         ),
+        Variable("noise", "float32", (noise, *shape), ("realisation", *axes), {"units": "nJy", "long_name": text}),
         Variable("nimages", "uint8", shape, axes, {"long_name": "number of exposures"}),
-        Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star at the tile's centre, flat f_nu"}),
-    )
+        Variable("set", "uint16", shape, axes, {"long_name": "number of the set of exposures"}),
+        Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star of flat f_nu, mean over the tile"}),
+    ]  # fmt: skip
+    if inputs:
+        text = "unit star of flat f_nu of each exposure, as it is drizzled"
+        found.append(Variable("input_psf", "float32", (inputs, psf, psf), ("input", "v", "u"), {"long_name": text}))
+    return tuple(found)

@@ -13,37 +13,37 @@ from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Instrument
 from romandask.kernels.extract import (
     Found,
-    Layer,
     aperture_fluxes,
     detect,
     kron_fluxes,
-    mean_layer,
-    median_layer,
     psf_fluxes,
     psf_half_light_radius,
     select,
 )
 from romandask.model.config import DetectionSettings
 from romandask.model.sky import Region, cells_in_cone
-from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.model.tiles import Tile, TileGrid
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
+from romandask.tile_layers import TileBands
 
-VISIT = 30.0
-"""Seconds of a visit, where a coadd's weight is not its exposure time."""
 EXTENDED = 1.15
 """Half-light radius over the PSF's above which an object counts as extended."""
 
 
-def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region) -> TableProduct:
-    """Return the lazy detections of a survey's coadds: one unit a tile, each object in the one tile that owns it."""
+def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region) -> ImageProduct:
+    """Return the lazy detections of a survey's coadds: one unit a tile, dims (tile, y, x).
+
+    The array `segmentation` has the number of the object in whose isophote a pixel lies, the last 24 bits of its
+    objectId; 0 for none. Beside each tile's is its table `objects`, each object in the one tile that owns it.
+    """
     maker = coadds.make
     if not isinstance(maker, DrizzleTile | DrawTile):
         raise TypeError("detections need the product that coadds() returns")
-    instrument = _instrument(maker)
+    instrument, pixels = _instrument(maker), maker.pixels
     bands = instrument.bands
     state = {
         "settings": settings.model_dump(exclude={"order"}), "bands": bands, "region": vars(region),
@@ -53,18 +53,25 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         Unit(tile.name, {**state, "tile": tile.name}, tuple((coadds.stage, f"{tile.name}-{band}") for band in bands))
         for tile in maker.tiles
     )
-    return TableProduct(
+    text = {"long_name": "number of the object, the last 24 bits of its objectId; 0 for none"}
+    return ImageProduct(
         f"detections/{instrument.name}",
         units,
         DetectTile(coadds, settings, region),
-        schema("objects", bands),
-        bytes_per_unit=maker.pixels**2 * 4 * (3 * len(bands) + 17) + (200 << 20),
-        seconds_per_unit=maker.pixels**2 * 1.2e-6,
+        (Variable("segmentation", "int32", (pixels, pixels), ("y", "x"), text),),
+        ("tile",),
+        (len(units),),
+        lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
+        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+        # image, error, map of objects and what sep keeps of them; some rows of all bands
+        bytes_per_unit=pixels**2 * 15 + pixels * min(pixels, 1024) * 12 * len(bands) + (250 << 20),
+        seconds_per_unit=pixels**2 * 1.2e-6,
+        tables={"objects": schema("objects", bands)},
     )
 
 
 def objects(
-    detections: TableProduct, coadds: ImageProduct, settings: DetectionSettings, region: Region
+    detections: ImageProduct, coadds: ImageProduct, settings: DetectionSettings, region: Region
 ) -> TableProduct:
     """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS)."""
     maker = coadds.make
@@ -89,7 +96,7 @@ def objects(
         f"objects/{name}",
         units,
         CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order),
-        detections.schema,
+        detections.tables["objects"],
         tuple(tiles_of),
         settings.order,
         400 << 20,
@@ -104,34 +111,24 @@ class DetectTile:
     settings: DetectionSettings
     region: Region
 
-    def __call__(self, index: int) -> pd.DataFrame:
-        """Return the objects that the tile owns (schema: catalogs/objects.yaml)."""
+    def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
+        """Return the map of a tile and the objects that it owns (schema: catalogs/objects.yaml)."""
         maker = self.coadds.make
         assert isinstance(maker, DrizzleTile | DrawTile)
-        instrument, tile = _instrument(maker), maker.tiles[index]
-        layers = {
-            band: load_layer(self.coadds, instrument, index, position, band)
-            for position, band in enumerate(instrument.bands)
-        }
-        chosen = [layers[band] for band in instrument.detection_bands or instrument.bands]
-        combined = median_layer(chosen) if instrument.detection == "median" else mean_layer(chosen)
-        settings = self.settings
-        found = detect(
+        instrument, tile, settings = _instrument(maker), maker.tiles[index], self.settings
+        bands = TileBands(self.coadds, instrument, index)
+        combined = bands.detection()
+        found, segments = detect(
             combined, settings.threshold, settings.min_area, settings.deblend_levels, settings.deblend_contrast
         )
+        radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
+        # a band at a time is in memory
+        del combined
         wcs = WCS(tile.header(maker.pixels, instrument.coadd_scale))
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region) & (found.snr >= settings.min_snr)
-        radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
-        return measure(select(found, keep), ra[keep], dec[keep], tile, layers, instrument, radius)
-
-
-def load_layer(coadds: ImageProduct, instrument: Instrument, tile: int, position: int, band: str) -> Layer:
-    """Return one band of a tile for photometry."""
-    arrays = coadds.load(tile * len(instrument.bands) + position)
-    seconds, per_unit = (arrays["weight"], 1.0) if instrument.coadd_from == "exposures" else (arrays["nimages"], VISIT)
-    rate = instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT * per_unit
-    return Layer(arrays["image"], arrays["noise"], arrays["weight"], seconds, rate, arrays["psf"])
+        objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, radius)
+        return {"segmentation": segments, "objects": objects}
 
 
 def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: Region) -> np.ndarray:
@@ -144,14 +141,13 @@ def measure(
     ra: np.ndarray,
     dec: np.ndarray,
     tile: Tile,
-    layers: dict[str, Layer],
-    instrument: Instrument,
+    bands: TileBands,
     psf_radius: float,
 ) -> pd.DataFrame:
     """Return the object table of some detections: positions, shapes, fluxes in every band."""
-    scale = instrument.coadd_scale
+    scale = bands.instrument.coadd_scale
     ring, column = divmod(tile.id, 1 << 32)
-    number = ((ring << 18) + column << 24) + np.arange(len(found.x), dtype=np.int64)
+    number = ((ring << 18) + column << 24) + found.label
     flags = found.flags.copy()
     columns = {
         "objectId": number,
@@ -168,14 +164,16 @@ def measure(
         "snr": found.snr,
         "extendedness": (found.half_light_radius > EXTENDED * psf_radius).astype(np.int8),
     }
-    for band, layer in layers.items():
+    for band in bands.instrument.bands:
+        layer = bands.layer(band)
         flux, error, flag = kron_fluxes(layer, found)
         flags |= flag.astype(np.int32)
         columns[f"{band}_kronFlux"], columns[f"{band}_kronFluxErr"] = flux, error
         columns[f"{band}_apFlux"], columns[f"{band}_apFluxErr"] = aperture_fluxes(
-            layer, found, instrument.aperture / scale
+            layer, found, bands.instrument.aperture / scale
         )
         columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(layer, found)
+        del layer
     frame = pd.DataFrame(columns | {"flags": flags})
     return with_spatial_index(frame, "coord_ra", "coord_dec")
 
@@ -184,19 +182,19 @@ def measure(
 class CollectPartition:
     """Makes one HEALPix partition of an object table from the tiles that reach into it."""
 
-    detections: TableProduct
+    detections: ImageProduct
     cells: tuple[int, ...]
     members: tuple[tuple[int, ...], ...]
     order: int
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the objects of the partition, by _healpix_29."""
-        parts = [self.detections.load(k) for k in self.members[index]]
+        parts = [self.detections.load(k, ("objects",))["objects"] for k in self.members[index]]
         shift = 2 * (29 - self.order)
         parts = [part[part["_healpix_29"].to_numpy() >> shift == self.cells[index]] for part in parts]
         filled = [part for part in parts if len(part)]
         if not filled:
-            return self.detections.schema.empty_table().to_pandas()
+            return self.detections.tables["objects"].empty_table().to_pandas()
         return pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
 
 

@@ -52,10 +52,11 @@ def differences(exposures: ImageProduct, index: int, side: int = 96) -> list[Dif
     truth = exposures.load(index, ("truth",))["truth"]
     light = truth + maker.instrument.background(exposure, maker.instrument.header(exposure))
     square = _square(truth, side)
-    planes, response = readout.planes(exposure), readout.response(exposure)
+    planes = readout.planes(exposure)
+    response = readout.response(exposure, planes)
     late = afterglow(age_and_traps(exposure, maker.left(index)))
     of = partial(readout.random, exposure)
-    charge, rays = readout.charge(exposure, light)
+    charge, rays = readout.charge(exposure, light, planes, response)
     whole = _electrons(read_out(charge, planes, response, of, late, rays)[0], planes, square)
 
     def without(changed: Planes, kept: np.ndarray | None = None, glow: np.ndarray | None = late) -> np.ndarray:

@@ -26,7 +26,7 @@ from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
-from romandask.readout import ScaReadout, before
+from romandask.readout import ScaReadout, before, trapped_table
 from romandask.runtime.manifest import read_record
 from romandask.runtime.products import Coordinates, ImageProduct, table_beside, to_frame
 from romandask.runtime.schemas import schema
@@ -119,8 +119,9 @@ class RenderExposure:
         if self.store is not None and read_record(self.store, stage, exposure.name):
             return to_frame(read_parquet(table_beside(self.store, stage, "trapped", exposure.name)))
         view = self.view(index)
-        charge, _ = self.readout.charge(exposure, self.expected(view) + view.background)
-        return self.readout.trapped(exposure, charge)
+        planes = self.readout.planes(exposure)
+        light, response = self.expected(view) + view.background, self.readout.response(exposure, planes)
+        return trapped_table(self.readout.charge(exposure, light, planes, response)[0], planes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from romandask.runtime.products import ImageProduct
 
 DAY = 86400.0
 """Seconds."""
-_STORED = 1024
+_STORED = 512
 """Rows of a stored chunk."""
 
 
@@ -64,6 +64,11 @@ def age_and_traps(exposure: Exposure, left: Sequence[tuple[Exposure, pd.DataFram
     ]
 
 
+def trapped_table(charge: np.ndarray, planes: Planes) -> pd.DataFrame:
+    """Return what stays in traps of a charge (4096, 4096), electrons (schema: catalogs/trapped.yaml)."""
+    return pd.DataFrame(vars(trap(charge, planes)))
+
+
 @dataclass(frozen=True)
 class ScaReadout:
     """Reads out exposures with every effect of their SCA."""
@@ -77,10 +82,11 @@ class ScaReadout:
         """Return the number of an exposure's SCA in the calibrations."""
         return self._maker.scas.index(exposure.detector)
 
-    def charge(self, exposure: Exposure, light: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def charge(
+        self, exposure: Exposure, light: np.ndarray, planes: Planes, response: Response
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return what light (electrons) leaves in the pixels, and what of it is cosmic rays' (both (4096, 4096))."""
         rays = self.rays(exposure)
-        planes, response = self.planes(exposure), self.response(exposure)
         return accumulate(light, planes, response, partial(self.random, exposure), rays), rays
 
     def rays(self, exposure: Exposure) -> np.ndarray | None:
@@ -88,10 +94,6 @@ class ScaReadout:
         if not self.instrument.settings.cosmic_rays:
             return None
         return hits((SIDE, SIDE), tracks((SIDE, SIDE), exposure.exptime, self.random(exposure, "rays", 0)))
-
-    def trapped(self, exposure: Exposure, charge: np.ndarray) -> pd.DataFrame:
-        """Return what stays of a charge (schema: catalogs/trapped.yaml)."""
-        return pd.DataFrame(vars(trap(charge, self.planes(exposure))))
 
     def __call__(
         self, exposure: Exposure, light: np.ndarray, left: Sequence[tuple[Exposure, pd.DataFrame]]
@@ -103,10 +105,11 @@ class ScaReadout:
         light : (4088, 4088) expected electrons of objects, sky and thermal emission
         left : exposures before it and what they left
         """
-        charge, rays = self.charge(exposure, light)
-        planes, response = self.planes(exposure), self.response(exposure)
+        planes = self.planes(exposure)
+        response = self.response(exposure, planes)
+        charge, rays = self.charge(exposure, light, planes, response)
         late = afterglow(age_and_traps(exposure, left))
-        trapped = self.trapped(exposure, charge)
+        trapped = trapped_table(charge, planes)
         raw, dq = read_out(charge, planes, response, partial(self.random, exposure), late, rays)
         del charge, rays, late
         image, variance = calibrate(raw, planes, response)
@@ -125,28 +128,29 @@ class ScaReadout:
             return of_whole
 
         # what is asked for a few rows at a time, in their order, is read as it is stored
+        read = product.reader(index)
         last: dict[str, tuple[int, np.ndarray]] = {}
 
         def of_store(name: str, rows: slice) -> np.ndarray:
             if axes[name][-1] != "x":
                 if name not in last:
-                    last[name] = 0, product.load(index, (name,))[name]
+                    last[name] = 0, read(name, ())
                 return last[name][1]
+            before_rows = (slice(None),) * (len(axes[name]) - 2)
             if rows == slice(None) or rows.start // _STORED != (rows.stop - 1) // _STORED:
-                return product.load(index, (name,), (*[slice(None)] * (len(axes[name]) - 2), rows))[name]
+                return read(name, (*before_rows, rows))
             part = rows.start // _STORED
             if name not in last or last[name][0] != part:
                 last.pop(name, None)
-                window = (*[slice(None)] * (len(axes[name]) - 2), slice(part * _STORED, (part + 1) * _STORED))
-                last[name] = part, product.load(index, (name,), window)[name]
+                last[name] = part, read(name, (*before_rows, slice(part * _STORED, (part + 1) * _STORED)))
             first = part * _STORED
             return last[name][1][..., rows.start - first : rows.stop - first, :]
 
         return of_store
 
-    def response(self, exposure: Exposure) -> Response:
+    def response(self, exposure: Exposure, planes: Planes) -> Response:
         """Return how an SCA answers the light of a band: means over its photons of a flat spectrum."""
-        band, planes = self.instrument.bandpass(exposure.band), self.planes(exposure)
+        band = self.instrument.bandpass(exposure.band)
         efficiency, electrons = (
             band_mean(planes(name, slice(None)), WAVES, band.wave, band.weights / band.wave).astype(np.float32)
             for name in ("RELQE2", "QYIELD")

@@ -32,6 +32,7 @@ from romandask.runtime.products import ImageProduct, TableProduct, conform, to_f
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store, read_parquet
 from romandask.runtime.units import Unit
+from romandask.star import Spectrum, coadd_psf
 from romandask.statistics import Statistics, matrix, statistics
 from romandask.truth import TruthCatalogs, truth
 from romandask.truth_index import truth_index
@@ -128,8 +129,22 @@ class Survey:
         return (Positions(self.object_product(catalog), "objectId", "coord_ra", "coord_dec"),)
 
     def coadds(self, survey: str) -> xr.Dataset:
-        """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, psf; coords tile, band, header ..."""
+        """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, set, psf ...; coords tile, band, ..."""
         return self.coadd_product(survey).dataset
+
+    def psf(
+        self, ra: float, dec: float, band: str, stamp: int | None = None, scale: float | None = None,
+        spectrum: Spectrum | None = None,
+    ) -> xr.DataArray:  # fmt: skip
+        """Return the image of a unit star (v, u) at a place of Roman's coadds: see `romandask.star.coadd_psf`.
+
+        It is as the coadd has it there, or, with a scale, sampled every so many arcsec with the star in the middle.
+        """
+        return coadd_psf(self.coadd_product("roman"), ra, dec, band, stamp, scale, spectrum)
+
+    def segmentation(self, survey: str) -> xr.Dataset:
+        """Return the lazy maps of detected objects (tile, y, x): `segmentation`, the last 24 bits of objectId."""
+        return self.detection_product(survey).dataset
 
     def objects(self, survey: str) -> dd.DataFrame:
         """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
@@ -252,7 +267,7 @@ class Survey:
             "coadds", survey, lambda: coadds(self.exposure_product(survey), self.tiles, self.pipeline.coadds)
         )
 
-    def detection_product(self, survey: str) -> TableProduct:
+    def detection_product(self, survey: str) -> ImageProduct:
         """The detections of each tile."""
         settings = self.pipeline.detections
         return self._once("detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region))

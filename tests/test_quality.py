@@ -17,8 +17,9 @@ LAYERS = [
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
-    {"matches", "detections", "cutouts", "effects"},
-    {"coadds"},
+    {"matches", "detections", "cutouts", "effects", "star"},
+    {"coadds", "tile_layers"},
+    {"coadd_psfs"},
     {"truth_index", "psfs"},
     {"exposures"},
     {"pointings", "truth", "readout"},
@@ -65,6 +66,13 @@ def test_kernels_and_model_know_no_dask_zarr_or_files():
     for path in [*(PACKAGE / "kernels").glob("*.py"), *(PACKAGE / "model").glob("*.py")]:
         text = path.read_text()
         assert not re.search(r"^(import|from) (dask|distributed|zarr|xarray|pyarrow)", text, re.M), path
+
+
+def test_kernels_that_make_images_round_alike_wherever_their_arrays_lie():
+    """With fastmath the plain and the vectorised form of a loop differ, and addresses choose between them."""
+    sums_only = {"photometry.py", "flux_table.py"}
+    for path in (PACKAGE / "kernels").glob("*.py"):
+        assert path.name in sums_only or "fastmath=True" not in path.read_text(), path
 
 
 def test_only_the_cluster_knows_distributed():

@@ -85,7 +85,8 @@ def test_every_object_is_in_one_tile_and_in_the_region(survey, name):
     names = {tile.id: tile.name for tile in survey.tiles}
     assert [names[value] for value in owner] == objects["tile"].tolist()
     assert survey.region.contains(objects["coord_ra"], objects["coord_dec"]).all()
-    detections = survey.detection_product(name).all_rows()
+    product = survey.detection_product(name)
+    detections = pd.concat([product.load(k, ("objects",))["objects"] for k in range(len(product.units))])
     assert sorted(detections["objectId"]) == sorted(objects["objectId"])
 
 

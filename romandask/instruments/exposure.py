@@ -114,6 +114,9 @@ class Instrument(Protocol):
     def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
         """Return the PSF at one place, exactly: of no use elsewhere, and sooner made than the whole."""
 
+    def psf_key(self, exposure: Exposure) -> tuple:
+        """Return what tells the PSFs of exposures apart: where it is the same they are."""
+
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return `edges` of that PSF, without the work of the whole."""
 

@@ -164,6 +164,10 @@ class Roman:
         profiles = self.profiles(exposure, x, y)
         return model(np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles]), grid)
 
+    def psf_key(self, exposure: Exposure) -> tuple:
+        """Return what tells PSFs apart: those of an SCA and band are the same in all exposures."""
+        return "roman", exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector)
+
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return how bright a unit star is at the edges of stamps."""
         return _edges(exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector))

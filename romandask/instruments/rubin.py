@@ -141,6 +141,10 @@ class Rubin:
         """Return the PSF of an exposure: it is the same everywhere."""
         return self.psf(exposure)
 
+    def psf_key(self, exposure: Exposure) -> tuple:
+        """Return what tells PSFs apart: each exposure has its own seeing."""
+        return "rubin", exposure.band, self.n_waves, exposure.seeing, exposure.airmass
+
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return how bright a unit star is at the edges of stamps."""
         return self.psf(exposure).edges

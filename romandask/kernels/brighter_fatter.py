@@ -60,12 +60,12 @@ def brighter_fatter(charge: np.ndarray, areas: np.ndarray, block: int, origin: t
     return _move(charge, padded, potential, block, origin[0], origin[1])
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _move(charge, padded, potential, block, first_row, first_column):
     ny, nx = charge.shape
     field = np.empty((2, nx), np.float32)
     out = charge.copy()
-    below = np.empty(nx, np.float32)
+    moved = np.empty(nx, np.float32)
     for y in range(ny):
         # the potential at the pixels of this row and of the next, each of the charge around it
         for row in range(2):
@@ -79,20 +79,22 @@ def _move(charge, padded, potential, block, first_row, first_column):
         # a boundary moves by the step of the potential across it, half of the final one on average
         for x in range(nx - 1):
             shift = np.float32(0.5) * (field[0, x] - field[0, x + 1])
-            moved = shift * np.float32(0.5) * (charge[y, x] + charge[y, x + 1])
-            out[y, x] += moved
-            out[y, x + 1] -= moved
+            moved[x] = shift * np.float32(0.5) * (charge[y, x] + charge[y, x + 1])
+        for x in range(nx - 1):
+            out[y, x] += moved[x]
+        for x in range(nx - 1):
+            out[y, x + 1] -= moved[x]
         if y + 1 < ny:
             for x in range(nx):
                 shift = np.float32(0.5) * (field[0, x] - field[1, x])
-                below[x] = shift * np.float32(0.5) * (charge[y, x] + charge[y + 1, x])
+                moved[x] = shift * np.float32(0.5) * (charge[y, x] + charge[y + 1, x])
             for x in range(nx):
-                out[y, x] += below[x]
-                out[y + 1, x] -= below[x]
+                out[y, x] += moved[x]
+                out[y + 1, x] -= moved[x]
     return out
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _potential(padded, potential, block, detector_row, first_column, row, out):
     """Write the potential of the charge around each pixel of a row; the outer ring of the kernels is zero."""
     nx = out.shape[0]
@@ -103,8 +105,8 @@ def _potential(padded, potential, block, detector_row, first_column, row, out):
         a = (first_column + x) // block
         end = min(nx, (a + 1) * block - first_column)
         for j in range(1, 6):
-            for i in range(1, 6):
-                value = potential[b, a, j, i]
-                for k in range(x, end):
-                    out[k] += value * padded[row + j, k + i]
+            p1, p2, p3, p4, p5 = potential[b, a, j, 1:6]
+            for k in range(x, end):
+                here = padded[row + j]
+                out[k] += p1 * here[k + 1] + p2 * here[k + 2] + p3 * here[k + 3] + p4 * here[k + 4] + p5 * here[k + 5]
         x = end

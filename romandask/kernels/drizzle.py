@@ -1,115 +1,215 @@
-"""Drizzling one exposure at a time onto a tile: the square kernel of the `drizzle` package, exposures streamed."""
+"""Drizzling exposures, one at a time, onto a tile: the square kernel, all planes of an exposure in one pass.
+
+Every pixel of an exposure, shrunk by pixfrac, is a quadrilateral on the tile and gives each tile pixel its light in
+proportion to the exact area of their overlap (Fruchter & Hook 2002). Areas are those that font rasterisers find: each
+side adds to the cells that it crosses the signed area between itself and their right edges, and to the next cell the
+rest of its height; sums along a row are then the covered shares.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
+import numba
 import numpy as np
-from astropy.wcs import WCS
-from drizzle.resample import Drizzle
-from scipy.interpolate import RectBivariateSpline
 
-GRID = 64
-"""Pixels between the points at which the map between two WCSs is computed exactly."""
-STRIP = 512
-"""Rows of a strip, about."""
-MARGIN = 4
-"""Pixels around the part of an exposure that falls on a tile."""
+from romandask.kernels.pixel_map import PixelMap
 
-
-@dataclass(frozen=True)
-class Strip:
-    """Some rows of the part of an exposure that falls on a tile."""
-
-    rows: slice
-    columns: slice
-
-
-def strips(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple[int, int]) -> list[Strip]:
-    """Return the part of a source image that may fall on a target image, in strips of rows; empty where none does.
-
-    Strips bound the memory of the map between the two images, 16 bytes a pixel.
-    """
-    ys, xs = (np.unique(np.r_[np.arange(0, n - 1, GRID), n - 1]) for n in shape)
-    x, y = _through(source, target, *np.meshgrid(xs, ys))
-    ny, nx = target_shape
-    on = (x > -MARGIN) & (x < nx + MARGIN) & (y > -MARGIN) & (y < ny + MARGIN)
-    # a target smaller than the grid's step may lie between its points: find it from its own side too
-    edge = np.linspace(-0.5, 1, 9)
-    back = _through(target, source, *(axis.ravel() for axis in np.meshgrid(edge * nx, edge * ny)))
-    inside = (back[0] > -0.5) & (back[0] < shape[1] - 0.5) & (back[1] > -0.5) & (back[1] < shape[0] - 0.5)
-    if not on.any() and not inside.any():
-        return []
-    u = np.concatenate([np.broadcast_to(xs, on.shape)[on], back[0][inside]])
-    v = np.concatenate([np.broadcast_to(ys[:, None], on.shape)[on], back[1][inside]])
-    columns, rows = _bounds(u, shape[1]), _bounds(v, shape[0])
-    # of like height: the package refuses a map of a single row
-    edges = np.linspace(rows.start, rows.stop, max(1, round((rows.stop - rows.start) / STRIP)) + 1).astype(int).tolist()
-    return [Strip(slice(low, high), columns) for low, high in itertools.pairwise(edges)]
-
-
-def pixel_map(source: WCS, target: WCS, rows: slice, columns: slice) -> np.ndarray:
-    """Return where the pixels of a part of the source fall on the target, (ny, nx, 2), 0 at the first pixel's centre.
-
-    The map is computed through both WCSs on a grid of every 64th pixel and interpolated by cubic splines: for Roman's
-    fourth-order distortion the largest error over an SCA is below 1e-5 tile pixels.
-    """
-    ys, xs = (_knots(part) for part in (rows, columns))
-    x, y = _through(source, target, *np.meshgrid(xs, ys))
-    pixmap = np.empty((rows.stop - rows.start, columns.stop - columns.start, 2))
-    order = [min(3, len(axis) - 1) for axis in (ys, xs)]
-    at = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
-    for plane, values in enumerate((x, y)):
-        pixmap[..., plane] = RectBivariateSpline(ys, xs, values, kx=order[0], ky=order[1], s=0)(*at)
-    return pixmap
+MOST_SETS = 65_535
+"""Different sets of exposures on one tile."""
+_LEAST = 1e-9
+"""Share of a tile pixel below which an overlap is rounding."""
 
 
 class Sums:
-    """The running weighted sums of images drizzled onto one grid; all images of an exposure share map and weight."""
+    """The running weighted sums of the exposures of a tile, and which exposures each of its pixels has.
+
+    All planes of an exposure share map and weight. Sets are numbered in the order in which they first appear, from 0,
+    that of no exposure.
+    """
 
     def __init__(self, shape: tuple[int, int], planes: int, pixfrac: float):
-        self._drizzles = [
-            Drizzle(kernel="square", fillval="0", out_shape=shape, disable_ctx=True) for _ in range(planes)
-        ]
+        self._sums = tuple(np.zeros(shape, np.float32) for _ in range(planes))
         self._pixfrac = pixfrac
-        self.count = np.zeros(shape, np.uint8)
-        """Number of exposures that contribute to each pixel."""
+        self._links: list[tuple[int, int]] = [(0, -1)]
+        self._exposures = 0
+        self.weight = np.zeros(shape, np.float32)
+        """Sum of weights, (ny, nx)."""
+        self.set = np.zeros(shape, np.uint16)
+        """Number of the set of exposures that contribute to each pixel."""
 
-    def add(self, parts: Iterable[tuple[list[np.ndarray], np.ndarray, np.ndarray]]) -> None:
-        """Add one exposure in strips of (images in surface brightness, weight, map); weight 0 where a pixel is bad."""
-        before = self.weight.copy()
-        for images, weight, pixmap in parts:
-            for drizzle, image in zip(self._drizzles, images, strict=True):
-                drizzle.add_image(
-                    image, exptime=1.0, pixmap=pixmap, weight_map=weight, pixfrac=self._pixfrac, in_units="cps"
-                )
-        self.count += self.weight > before
+    def add(self, parts: Iterable[tuple[Sequence[np.ndarray], np.ndarray, PixelMap]]) -> None:
+        """Add one exposure in parts of (images in surface brightness, weight, map); weight 0 where a pixel is bad."""
+        first = len(self._links)
+        follow = np.full(first, -1, np.int32)
+        parents = np.zeros(MOST_SETS + 1 - first, np.int32)
+        count = 0
+        for images, weight, pixel_map in parts:
+            rows = np.arange(pixel_map.rows.start, pixel_map.rows.stop, dtype=float)
+            half = self._pixfrac / 2
+            count = _drizzle(
+                tuple(np.ascontiguousarray(image, np.float32) for image in images),
+                np.ascontiguousarray(weight, np.float32), pixel_map.curves(rows - half), pixel_map.curves(rows + half),
+                pixel_map.x, pixel_map.columns.start, half, self._sums, self.weight, self.set, follow, parents, count,
+            )  # fmt: skip
+            if count < 0:
+                raise ValueError(f"more than {MOST_SETS} different sets of exposures on one tile: make tiles smaller")
+        self._links += [(int(parent), self._exposures) for parent in parents[:count]]
+        self._exposures += 1
 
     @property
-    def weight(self) -> np.ndarray:
-        """Sum of weights, (ny, nx) float32."""
-        return self._drizzles[0].out_wht
+    def sets(self) -> list[tuple[int, ...]]:
+        """The exposures of each set, as numbers in the order in which they were added."""
+        found: list[tuple[int, ...]] = [()]
+        for parent, exposure in self._links[1:]:
+            found.append((*found[parent], exposure))
+        return found
 
-    def image(self, plane: int) -> np.ndarray:
-        """Weighted mean of a plane; 0 where nothing falls."""
-        return np.where(self.weight > 0, self._drizzles[plane].out_img, 0).astype(np.float32)
+    @property
+    def count(self) -> np.ndarray:
+        """Number of exposures that contribute to each pixel, (ny, nx) uint8."""
+        return np.array([min(len(members), 255) for members in self.sets], np.uint8)[self.set]
+
+    def means(self) -> list[np.ndarray]:
+        """Return the weighted means of the planes, 0 where nothing falls.
+
+        They are in the place of the sums: nothing can be added any more.
+        """
+        for plane in self._sums:
+            np.divide(plane, self.weight, out=plane, where=self.weight > 0)
+        return list(self._sums)
 
 
-def _through(source: WCS, target: WCS, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    shape = x.shape
-    ra, dec = source.all_pix2world(x.ravel(), y.ravel(), 0)
-    tx, ty = target.all_world2pix(ra, dec, 0, quiet=True)
-    return tx.reshape(shape), ty.reshape(shape)
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets, follow, parents, count):
+    """Add the pixels of a part of an exposure; return how many sets are new by now, -1 where they are too many.
+
+    `lower` and `upper` are the curves of the lower and upper sides of each row's pixels.
+    """
+    ny, nx = weight.shape
+    height, width = total.shape
+    step = knots[1] - knots[0]
+    cells = np.zeros((_window(lower, upper, step), _window(lower, upper, step) + 2))
+    values, known = np.empty(len(images), np.float32), len(follow)
+    # column after column of pieces of rows: what one falls on the next falls on too, and it is still in cache
+    for piece in range(len(knots) - 1):
+        begin = max(int(np.ceil(knots[piece])) - first, 0)
+        end = nx if piece == len(knots) - 2 else min(int(np.ceil(knots[piece + 1])) - first, nx)
+        for row in range(ny):
+            low, high = lower[row, :, piece], upper[row, :, piece]
+            if _beyond(low, high, step, len(cells), height, width):
+                continue
+            for column in range(begin, end):
+                w = weight[row, column]
+                if w <= 0:
+                    continue
+                near, far = column + first - knots[piece] - half, column + first - knots[piece] + half
+                # pixel k of the tile is from k to k + 1 here
+                ax, ay = _cubic(low[0], near) + 0.5, _cubic(low[1], near) + 0.5
+                bx, by = _cubic(low[0], far) + 0.5, _cubic(low[1], far) + 0.5
+                cx, cy = _cubic(high[0], far) + 0.5, _cubic(high[1], far) + 0.5
+                dx, dy = _cubic(high[0], near) + 0.5, _cubic(high[1], near) + 0.5
+                left, right = np.floor(min(ax, bx, cx, dx)), np.floor(max(ax, bx, cx, dx))
+                bottom, top = np.floor(min(ay, by, cy, dy)), np.floor(max(ay, by, cy, dy))
+                if right < 0 or left >= width or top < 0 or bottom >= height:
+                    continue
+                given = np.float32(w / abs(0.5 * ((cx - ax) * (dy - by) - (dx - bx) * (cy - ay))))
+                _side(cells, ax - left, ay - bottom, bx - left, by - bottom)
+                _side(cells, bx - left, by - bottom, cx - left, cy - bottom)
+                _side(cells, cx - left, cy - bottom, dx - left, dy - bottom)
+                _side(cells, dx - left, dy - bottom, ax - left, ay - bottom)
+                for plane in range(len(images)):
+                    values[plane] = given * images[plane][row, column]
+                x0, y0, columns = int(left), int(bottom), int(right - left) + 1
+                within = x0 >= 0 and y0 >= 0 and right < width and top < height
+                for j in range(int(top - bottom) + 1):
+                    covered = 0.0
+                    y = y0 + j
+                    for i in range(columns):
+                        covered += cells[j, i]
+                        cells[j, i] = 0
+                        share = np.float32(abs(covered))
+                        x = x0 + i
+                        if share < _LEAST or not (within or (0 <= y < height and 0 <= x < width)):
+                            continue
+                        total[y, x] += given * share
+                        for plane in range(len(images)):
+                            sums[plane][y, x] += share * values[plane]
+                        old = sets[y, x]
+                        if old < known:
+                            if follow[old] < 0:
+                                if count >= len(parents):
+                                    return -1
+                                follow[old] = known + count
+                                parents[count] = old
+                                count += 1
+                            sets[y, x] = follow[old]
+                    cells[j, columns] = 0
+                    cells[j, columns + 1] = 0
+    return count
 
 
-def _bounds(values: np.ndarray, length: int) -> slice:
-    low, high = np.nanmin(values), np.nanmax(values)
-    return slice(max(0, int(low) - GRID - MARGIN), min(length, int(high) + GRID + MARGIN + 1))
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _cubic(c, t):
+    return ((c[0] * t + c[1]) * t + c[2]) * t + c[3]
 
 
-def _knots(part: slice) -> np.ndarray:
-    """Return at least four points, the least of a cubic, over some rows or columns; beyond them where they are few."""
-    count = max(4, (part.stop - part.start) // GRID + 2)
-    return np.linspace(part.start, max(part.stop - 1, part.start + 3), count)
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _window(lower, upper, step):
+    """Return the most tile pixels along one axis that a source pixel may touch: its width and height, and a rest."""
+    most = 0.0
+    for row in range(len(lower)):
+        for axis in range(2):
+            for piece in range(lower.shape[2]):
+                c = lower[row, axis, piece]
+                along = abs(_cubic(c, step) - _cubic(c, 0.0)) / step
+                most = max(most, along + abs(upper[row, axis, piece, 3] - c[3]))
+    return int(1.1 * most) + 3
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _beyond(low, high, step, margin, height, width):
+    """Return whether a piece of a row, as good as straight, lies outside the tile."""
+    for axis in range(2):
+        length = width if axis == 0 else height
+        a, b = _cubic(low[axis], 0.0), _cubic(low[axis], step)
+        if max(a, b) < -margin or min(a, b) > length + margin:
+            return True
+    return False
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _side(cells, x0, y0, x1, y1):
+    """Add a side of a quadrilateral to the cells: signed areas, of which sums along a row are covered shares."""
+    if y0 == y1:
+        return
+    sign = 1.0
+    if y0 > y1:
+        x0, y0, x1, y1, sign = x1, y1, x0, y0, -1.0
+    slope = (x1 - x0) / (y1 - y0)
+    x, y, j = x0, y0, int(y0)
+    while y < y1:
+        top = min(j + 1.0, y1)
+        beyond = x1 if top == y1 else x + slope * (top - y)
+        a, b = min(x, beyond), max(x, beyond)
+        tall = sign * (top - y)
+        first, last = int(a), int(b)
+        if first == last:
+            middle = 0.5 * (a + b) - first
+            cells[j, first] += tall * (1 - middle)
+            cells[j, first + 1] += tall * middle
+        else:
+            per = 1 / (b - a)
+            start, stop = 1 - (a - first), b - last
+            head, tail = 0.5 * per * start * start, 0.5 * per * stop * stop
+            cells[j, first] += tall * head
+            if last == first + 1:
+                cells[j, last] += tall * (1 - head - tail)
+            else:
+                so_far = per * (start + 0.5)
+                cells[j, first + 1] += tall * (so_far - head)
+                for k in range(first + 2, last):
+                    cells[j, k] += tall * per
+                cells[j, last] += tall * (1 - so_far - (last - first - 2) * per - tail)
+            cells[j, last + 1] += tall * tail
+        x, y, j = beyond, top, j + 1

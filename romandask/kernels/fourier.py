@@ -2,6 +2,9 @@
 
 The frequencies of a stamp that the PSF reaches lie one after another in flat arrays, row by row, so that the loops
 over them are vectorised: amplitudes of the PSF's modes, then the profile's transform, then phases and folding.
+
+Nothing here is compiled with fastmath: a loop has a vectorised and a plain form, of which the places of its arrays in
+memory choose one, and with fused operations the two differ in the last bit, so that pixels would with the memory.
 """
 
 from __future__ import annotations
@@ -122,7 +125,7 @@ def _phases(angle, lowest, out):
         value *= turn
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _squares(matrix, kx, ky, out):
     """Write |M^T k|^2: the squared frequency in the frame in which the profile is round."""
     xx = np.float32(matrix[0, 0] ** 2 + matrix[0, 1] ** 2)
@@ -132,7 +135,7 @@ def _squares(matrix, kx, ky, out):
         out[i] = xx * kx[i] * kx[i] + xy * kx[i] * ky[i] + yy * ky[i] * ky[i]
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _exponential(squares, re, im, total_re, total_im):
     for i in range(squares.shape[0]):
         t = np.float32(1) + _DISK * squares[i]
@@ -141,7 +144,7 @@ def _exponential(squares, re, im, total_re, total_im):
         total_im[i] += value * im[i]
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _devaucouleurs(squares, table, re, im, total_re, total_im):
     bits = squares.view(np.int32)
     part = np.float32(1.0 / (1 << _SHIFT))
@@ -166,7 +169,7 @@ def _within(xx, xy, yy, y, step):
     return max(0, int((np.sqrt(square) - xy * y) / (xx * step)) + 1)
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, total_re, total_im):
     """Add points at the places that an identity gives, each smoothed by a Gaussian, of equal light."""
     xx = smoothing[0, 0] ** 2 + smoothing[0, 1] ** 2
@@ -199,7 +202,7 @@ def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, t
             total_im[first + i] += s * im[first + i] + t * re[first + i]
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _fold(total_re, total_im, starts, columns, rows, reach, real, imaginary):
     """Add phases and fold frequencies to those of the pixel grid: (size, size / 2 + 1), zeros at first."""
     size = real.shape[0]

@@ -27,8 +27,12 @@ def expand(blocks: np.ndarray, block: int, rows: slice, columns: slice = slice(N
     array([[1, 1, 2, 2]])
     """
     ny, nx = (length * block for length in blocks.shape[-2:])
-    y, x = np.arange(ny)[rows] // block, np.arange(nx)[columns] // block
-    return blocks[..., y[:, None], x[None, :]]
+    first, last, _ = rows.indices(ny)
+    # the rows of a block are one row, seen as many times as it is asked for
+    wide = np.repeat(blocks[..., first // block : -(-last // block), :], block, axis=-1)[..., columns]
+    if wide.shape[-2] == 1:
+        return np.broadcast_to(wide, (*wide.shape[:-2], last - first, wide.shape[-1]))
+    return wide[..., np.arange(first, last) // block - first // block, :]
 
 
 def quantum_efficiency(light: np.ndarray, white: np.ndarray, coloured: np.ndarray) -> np.ndarray:
@@ -75,13 +79,13 @@ def count_rate_nonlinearity(electrons: np.ndarray, exponent: np.ndarray | float,
     A rate r, e/s, is counted as r (r / RATE)^exponent (CRNL; de Jong et al. 2006).
     """
     relative = np.maximum(electrons / (exptime * RATE), np.float32(1e-6))
-    return electrons * relative**exponent
+    return electrons * np.exp(exponent * np.log(relative))
 
 
 def count_rate_linearity(electrons: np.ndarray, exponent: np.ndarray | float, exptime: float) -> np.ndarray:
     """Return what `count_rate_nonlinearity` was given."""
     relative = np.maximum(electrons / (exptime * RATE), np.float32(1e-6))
-    return electrons * relative ** (-exponent / (1 + np.asarray(exponent)))
+    return electrons * np.exp(-exponent / (1 + np.asarray(exponent)) * np.log(relative))
 
 
 def persistence(charge: np.ndarray, planes: np.ndarray, age: float) -> np.ndarray:
@@ -146,7 +150,7 @@ def interpixel_capacitance(
     return _spread(np.ascontiguousarray(signal, np.float32), kernels, block, origin[0], origin[1])
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@numba.njit(nogil=True, cache=True)
 def _spread(signal, kernels, block, first_row, first_column):
     ny, nx = signal.shape
     out = np.zeros((ny, nx), np.float32)

@@ -47,6 +47,10 @@ _ROWS = 32
 """Rows that share a random generator, and are worked on while they are in the processor's cache."""
 _SMALL = 20.0
 """Expected electrons up to which Poisson numbers are found by inversion."""
+_STRIP = 1024
+"""Pixels whose numbers are found together."""
+_ALIKE = 6
+"""Numbers up to this are found for a whole strip."""
 
 Planes = Callable[[str, slice], np.ndarray]
 """Gives some rows of the whole detector (BORDER included) of a named calibration; blocks, whole, where it has those.
@@ -234,17 +238,29 @@ def _invert(mean, none, uniform):
     over = np.zeros(101, np.float32)
     for k in range(1, 101):
         over[k] = 1 / k
-    out = np.zeros(mean.shape[0], np.float32)
-    for i in range(mean.shape[0]):
-        if mean[i] <= 0 or mean[i] > _SMALL:
-            continue
-        share = none[i]
-        left, k = uniform[i] - share, 0
-        while left > 0 and k < 100:
-            k += 1
-            share *= mean[i] * over[k]
-            left -= share
-        out[i] = k
+    size = mean.shape[0]
+    out = np.empty(size, np.float32)
+    left, share = np.empty(_STRIP, np.float32), np.empty(_STRIP, np.float32)
+    for first in range(0, size, _STRIP):
+        count = min(_STRIP, size - first)
+        m, found = mean[first : first + count], out[first : first + count]
+        for i in range(count):
+            share[i] = none[first + i]
+            left[i] = uniform[first + i] - share[i] if m[i] <= _SMALL else np.float32(0)
+            found[i] = 0
+        # the first few numbers for all pixels at once, without a branch; the few larger ones one by one
+        for k in range(1, _ALIKE):
+            for i in range(count):
+                found[i] += np.float32(left[i] > 0)
+                share[i] *= m[i] * over[k]
+                left[i] -= share[i]
+        for i in range(count):
+            k = _ALIKE - 1
+            while left[i] > 0 and k < 100:
+                found[i] += 1
+                k += 1
+                share[i] *= m[i] * over[k]
+                left[i] -= share[i]
     return out
 
 

@@ -111,6 +111,7 @@ class CoaddSettings(Section):
     pixels: int = Field(8825, gt=32, description="side of a padded tile, pixels")
     overlap: int = Field(500, ge=0, description="padding on every edge, pixels")
     pixfrac: float = Field(0.7, gt=0, le=1, description="drop size over input pixel")
+    noise: int = Field(1, ge=1, le=20, description="noise realisations of each tile and band")
 
     @model_validator(mode="after")
     def _has_inside(self) -> CoaddSettings:

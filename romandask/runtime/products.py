@@ -20,7 +20,15 @@ import zarr
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.runtime.manifest import Digest, digest, read_record
-from romandask.runtime.store import Store, Variable, open_images, read_parquet, write_coordinate, write_parquet
+from romandask.runtime.store import (
+    Store,
+    Variable,
+    open_images,
+    read_parquet,
+    write_array,
+    write_coordinate,
+    write_parquet,
+)
 from romandask.runtime.units import Unit, names_of
 
 Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
@@ -77,17 +85,35 @@ class ImageProduct:
         """True where the store has a unit."""
         return self.store is not None and read_record(self.store, self.stage, self.names[index]) is not None
 
-    def load(
-        self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()
-    ) -> dict[str, np.ndarray]:
-        """Return the arrays of a unit, or a window of them: read where the manifest has it, made where not."""
+    def load(self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()) -> dict[str, Any]:
+        """Return the arrays of a unit, or a window of them: read where the manifest has it, made where not.
+
+        Tables of the unit are among them, whole, where `names` has theirs.
+        """
         wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
+        tables = [name for name in self.tables if name in (names or ())]
         if self.store is not None and self.has(index):
-            group = zarr.open_group(self.store.images(self.stage), mode="r")
-            place = np.unravel_index(index, self.lengths)
-            return {name: _array(group, name)[(*place, *window)] for name in wanted}
+            read = self.reader(index)
+            beside = {name: table_beside(self.store, self.stage, name, self.names[index]) for name in tables}
+            found = {name: to_frame(read_parquet(path)) for name, path in beside.items()}
+            return {**{name: read(name, window) for name in wanted}, **found}
         made = self.make(index)
-        return {name: made[name][window] for name in wanted}
+        return {**{name: made[name][window] for name in wanted}, **{name: made[name] for name in tables}}
+
+    def reader(self, unit: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
+        """Return what reads a window of an array of a stored unit: arrays are opened once, however many windows."""
+        assert self.store is not None
+        group = zarr.open_group(self.store.images(self.stage), mode="r")
+        place = self._place(unit)
+        opened: dict[str, zarr.Array] = {}
+
+        def read(name: str, window: tuple[slice, ...] = ()) -> np.ndarray:
+            if name not in opened:
+                opened[name] = _array(group, name)
+            index: tuple[int | slice, ...] = (*place, *window)
+            return np.asarray(opened[name][index])
+
+        return read
 
     def prepare(self, store: Store) -> None:
         """Make the arrays and coordinates that units are written into."""
@@ -107,14 +133,15 @@ class ImageProduct:
             write_parquet(table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name))
             for name, kind in self.tables.items()
         ]
-        return self._written(((v.name, arrays[v.name]) for v in self.variables), index, store, *tables)
+        # each is let go once it is written
+        return self._written(((v.name, arrays.pop(v.name)) for v in self.variables), index, store, *tables)
 
     def _written(self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, *tables: bytes) -> Made:
         """Write the arrays of a unit, one after another."""
         variables = {variable.name: variable for variable in self.variables}
         state, size, rows = Digest(), 0, 0
         group = zarr.open_group(store.images(self.stage), mode="r+")
-        place = np.unravel_index(index, self.lengths)
+        place = self._place(index)
         for name, array in arrays:
             variable = variables.pop(name)
             if array.shape != variable.shape or not np.isfinite(array).all():
@@ -122,14 +149,19 @@ class ImageProduct:
                     f"{self.stage} {self.names[index]}: {variable.name} has shape {array.shape}, expected "
                     f"{variable.shape}, or values that are not finite"
                 )
-            _array(group, variable.name)[place] = array.astype(variable.dtype, copy=False)
+            write_array(_array(group, variable.name), place, array.astype(variable.dtype, copy=False))
             state.add(array)
             size, rows = size + array.nbytes, max(rows, array.size)
+            del array
         if variables:
             raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
         for table in tables:
             state.add(table)
         return Made(state.value(), size, rows)
+
+    def _place(self, index: int) -> tuple[int, ...]:
+        """Return the indices of a unit along the axes of units."""
+        return tuple(int(k) for k in np.unravel_index(index, self.lengths))
 
     @cached_property
     def dataset(self) -> xr.Dataset:

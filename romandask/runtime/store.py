@@ -21,6 +21,8 @@ from romandask.model.errors import UserError
 CELL = "_healpix_29"
 """Column of HEALPix cells of order 29, by which the rows of catalogs are sorted."""
 ROWS_A_GROUP = 50_000
+_SHARD = 4
+"""Inner chunks along each side of a shard."""
 MARGIN = "_margin"
 """Ending of the names of stages that make a catalog's margin."""
 
@@ -38,7 +40,7 @@ class Variable:
     attributes: dict[str, Any]
     """units, long_name, ..."""
     compress: bool = True
-    """False where it would gain little and cost every reader time."""
+    """False where it would gain little and cost every reader time: a chunk is then a file of whole rows."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,10 @@ def open_images(
 ) -> zarr.Group:
     """Open, or make, the Zarr group of an image product with `lengths` units along the axes `axes`.
 
-    One unit is one shard (one writer), cut in inner chunks of about 1k x 1k, each with a checksum. An array made for
-    another number of units is resized.
+    No two units (two writers) share a shard; one is cut in inner chunks of about 1k x 1k, each with a checksum, and is
+    of at most 4 x 4 of them, for what is written at a time is in memory several times. Variables that are not
+    compressed have no shards: their files are of about 512 whole rows. An array made for another number of units is
+    resized.
     """
     group = zarr.open_group(path, mode="a")
     for variable in variables:
@@ -162,14 +166,13 @@ def open_images(
                 continue
         ones = (1,) * len(lengths)
         packing = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")] if variable.compress else []
-        inner = tuple(_inner_chunk(length) for length in variable.shape)
-        shard = tuple(-(-length // chunk) * chunk for length, chunk in zip(variable.shape, inner, strict=True))
+        inner, shard = _chunks(variable)
         group.create_array(
             variable.name,
             shape=shape,
             dtype=variable.dtype,
             chunks=ones + inner,
-            shards=ones + shard,
+            shards=None if shard is None else ones + shard,
             compressors=[*packing, Crc32cCodec()],
             fill_value=0,
             dimension_names=(*axes, *variable.axes),
@@ -178,6 +181,15 @@ def open_images(
             overwrite=True,
         )
     return group
+
+
+def write_array(array: zarr.Array, place: tuple[int, ...], values: np.ndarray) -> None:
+    """Write the values of one unit, some rows of shards at a time."""
+    files = (array.shards or array.chunks)[len(place) :]
+    rows = files[-2] if len(files) > 1 else files[0]
+    for first in range(0, values.shape[-2] if len(files) > 1 else 1, rows):
+        part = (..., slice(first, first + rows), slice(None)) if len(files) > 1 else (...,)
+        array[(*place, *part)] = values[part]
 
 
 def write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict) -> None:
@@ -196,6 +208,16 @@ def write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axes: tup
     array[...] = values.astype(object) if text else values
 
 
-def _inner_chunk(length: int) -> int:
-    """Return a chunk of about 1024 that divides the length as evenly as it can."""
-    return -(-length // max(1, round(length / 1024)))
+def _chunks(variable: Variable) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
+    """Return the shapes of the chunks of a unit and of its shards; None where there are none."""
+    many, image = variable.shape[:-2], variable.shape[-2:]
+    if not variable.compress:
+        return (*many, *(_inner_chunk(length, 512) for length in image[:-1]), image[-1]), None
+    inner = tuple(_inner_chunk(length) for length in image)
+    shard = (min(_SHARD, -(-length // chunk)) * chunk for length, chunk in zip(image, inner, strict=True))
+    return (*(1 for _ in many), *inner), (*many, *shard)
+
+
+def _inner_chunk(length: int, about: int = 1024) -> int:
+    """Return a chunk of about some length that divides a length as evenly as it can."""
+    return -(-length // max(1, round(length / about)))

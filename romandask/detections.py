@@ -64,7 +64,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # image, error, map of objects and what sep keeps of them; some rows of all bands
-        bytes_per_unit=pixels**2 * 15 + pixels * min(pixels, 1024) * 12 * len(bands) + (250 << 20),
+        bytes_per_unit=pixels**2 * 19 + pixels * min(pixels, 1024) * 12 * len(bands) + (250 << 20),
         seconds_per_unit=pixels**2 * 1.2e-6,
         tables={"objects": schema("objects", bands)},
     )
@@ -127,7 +127,7 @@ class DetectTile:
         wcs = WCS(tile.header(maker.pixels, instrument.coadd_scale))
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region) & (found.snr >= settings.min_snr)
-        objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, radius)
+        objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, segments, radius)
         return {"segmentation": segments, "objects": objects}
 
 
@@ -142,6 +142,7 @@ def measure(
     dec: np.ndarray,
     tile: Tile,
     bands: TileBands,
+    segments: np.ndarray,
     psf_radius: float,
 ) -> pd.DataFrame:
     """Return the object table of some detections: positions, shapes, fluxes in every band."""
@@ -166,11 +167,11 @@ def measure(
     }
     for band in bands.instrument.bands:
         layer = bands.layer(band)
-        flux, error, flag = kron_fluxes(layer, found)
+        flux, error, flag = kron_fluxes(layer, segments, found)
         flags |= flag.astype(np.int32)
         columns[f"{band}_kronFlux"], columns[f"{band}_kronFluxErr"] = flux, error
         columns[f"{band}_apFlux"], columns[f"{band}_apFluxErr"] = aperture_fluxes(
-            layer, found, bands.instrument.aperture / scale
+            layer, segments, found, bands.instrument.aperture / scale
         )
         columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(layer, found)
         del layer

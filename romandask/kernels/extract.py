@@ -8,10 +8,11 @@ import numpy as np
 import sep
 from scipy import ndimage
 
+from romandask.kernels.apertures import kron_radii, sums
 from romandask.kernels.layer import TRIALS, Layer, at
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
-"""Kron aperture: this many Kron radii, and at least this many pixels."""
+"""Kron aperture: this many Kron radii, and at least this many semi-axes (PHOT_AUTOPARAMS of Source Extractor)."""
 NOT_DEBLENDED, NO_DATA = 256, 512
 FLAGS = {
     "deblended": sep.OBJ_MERGED,
@@ -37,7 +38,11 @@ class Found:
     label: np.ndarray
     """Number in the segmentation map, from 1."""
     x: np.ndarray
+    """Under a window."""
     y: np.ndarray
+    barycentre_x: np.ndarray
+    """Of the isophote: the middle of its apertures."""
+    barycentre_y: np.ndarray
     a: np.ndarray
     b: np.ndarray
     theta: np.ndarray
@@ -59,7 +64,10 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
     sep.set_sub_object_limit(16_384)
     image, error, mask = layer.image, layer.error, layer.mask
     error[mask] = 1.0
-    options = {"err": error, "mask": mask, "minarea": min_area, "clean": True, "segmentation_map": True}
+    # smoothed, but with the threshold in units of a pixel's own noise, as Source Extractor has it
+    options = {
+        "err": error, "mask": mask, "minarea": min_area, "filter_type": "conv", "clean": True, "segmentation_map": True,
+    }  # fmt: skip
     extra = 0
     try:
         found, segments = sep.extract(image, threshold, deblend_nthresh=levels, deblend_cont=contrast, **options)
@@ -74,21 +82,21 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
     # a line of pixels has no width; half a pixel keeps apertures defined
     a, b = np.maximum(a, 0.3), np.maximum(b, 0.3)
     theta = np.clip(theta, -np.pi / 2, np.pi / 2)
-    radius, kron_flag = sep.kron_radius(image, x, y, a, b, theta, 6.0, mask=mask)
-    radius = np.where(np.isfinite(radius), radius, 0.0)
-    radius = np.maximum(KRON_FACTOR * radius, KRON_MIN / np.sqrt(a * b))
-    flux, flux_error, flag = ellipse_flux(layer, x, y, a, b, theta, radius)
+    label = np.arange(1, len(x) + 1, dtype=np.int64)
+    radius = kron_radii(image, mask, segments, label, x, y, a, b, theta, 6.0)
+    dark = np.where(np.isfinite(radius), 0, sep.APER_NONPOSITIVE)
+    radius = np.maximum(KRON_FACTOR * np.nan_to_num(radius), KRON_MIN)
+    flux, flux_error, flag = ellipse_flux(layer, segments, label, x, y, a, b, theta, radius)
     half, half_flag = sep.flux_radius(
         image, x, y, 6.0 * a + 5, 0.5, normflux=np.where(flux > 0, flux, 1.0), mask=mask, subpix=5
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = np.where(flux_error > 0, flux / flux_error, 0.0)
     half = np.where(np.isfinite(half) & (half > 0), half, 1.0)
-    x, y = _windowed(image, mask, x, y, half)
-    label = np.arange(1, len(x) + 1, dtype=np.int64)
+    xw, yw = _windowed(image, mask, x, y, half)
     return Found(
-        label, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr,
-        (found["flag"] | kron_flag | flag | half_flag).astype(np.int32) | extra,
+        label, xw, yw, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr,
+        (found["flag"] | dark | flag | half_flag).astype(np.int32) | extra,
     ), segments  # fmt: skip
 
 
@@ -97,26 +105,29 @@ def select(found: Found, keep: np.ndarray) -> Found:
     return Found(**{name: value[keep] for name, value in vars(found).items()})
 
 
-def kron_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return flux, error and flags of a band in the apertures of the detection image."""
-    return ellipse_flux(layer, found.x, found.y, found.a, found.b, found.theta, found.kron_radius)
+def kron_fluxes(
+    layer: Layer, segments: np.ndarray, found: Found
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return flux, error and flags of a band in the apertures of the detection image, neighbours taken out."""
+    shape = (found.a, found.b, found.theta, found.kron_radius)
+    return ellipse_flux(layer, segments, found.label, found.barycentre_x, found.barycentre_y, *shape)
 
 
-def ellipse_flux(layer: Layer, x, y, a, b, theta, r) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return flux, error and flags in ellipses of `r` times the semi-axes.
+def ellipse_flux(layer: Layer, segments, label, x, y, a, b, theta, r) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return flux, error and flags in ellipses of `r` times the semi-axes, neighbours taken out.
 
     The error counts the correlations of the noise: that of white noise times the ratio measured on random apertures of
     the same area in the noise realisation; and the Poisson noise of the objects.
     """
     if not len(x):
         return np.empty(0), np.empty(0), np.empty(0, int)
-    flux, white, flag = sep.sum_ellipse(layer.image, x, y, a, b, theta, r, err=layer.error, mask=layer.mask, subpix=5)
+    flux, white, flag = sums(layer.image, layer.error, layer.mask, segments, label, x, y, a, b, theta, r)
     correlated = white * layer.ratio(r * np.sqrt(a * b))
     empty = at(layer.mask, x, y)
     return flux, np.sqrt(correlated**2 + layer.poisson(flux, x, y)), flag | np.where(empty, NO_DATA, 0)
 
 
-def aperture_fluxes(layer: Layer, found: Found, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def aperture_fluxes(layer: Layer, segments: np.ndarray, found: Found, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and error of every object in a circle (pixels), corrected to the total light of a point source.
 
     The correction is the share of the PSF image's light inside the circle; no detail of the PSF within it matters.
@@ -126,13 +137,11 @@ def aperture_fluxes(layer: Layer, found: Found, radius: float) -> tuple[np.ndarr
     middle = (layer.psf.shape[0] - 1) / 2
     psf = np.ascontiguousarray(layer.psf, dtype=np.float32)
     share = float(sep.sum_circle(psf, [middle], [middle], radius, subpix=5)[0][0])
-    flux, white, _ = sep.sum_circle(
-        layer.image, found.x, found.y, radius, err=layer.error, mask=layer.mask, subpix=5
-    )  # fmt: skip
+    one = np.ones(len(found.x))
+    flux, error, _ = ellipse_flux(layer, segments, found.label, found.x, found.y, one, one, 0 * one, radius * one)
     if not share > 0:
         return np.full(len(flux), np.nan), np.full(len(flux), np.nan)
-    correlated = white * layer.ratio(radius)
-    return flux / share, np.sqrt(correlated**2 + layer.poisson(flux, found.x, found.y)) / share
+    return flux / share, error / share
 
 
 def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
@@ -170,12 +179,13 @@ def _windowed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions under a Gaussian window (XWIN, YWIN): neighbours pull barycentres, and less these.
 
-    Where the window wanders off by more than the object's half-light radius the barycentre stays.
+    Where the window wanders off, by more than a pixel or the object's half-light radius, to a brighter neighbour for
+    example, the barycentre stays.
     """
     if not len(x):
         return x, y
     xw, yw, _ = sep.winpos(image, x, y, 2.0 / 2.35 * half, mask=mask)
-    good = np.hypot(xw - x, yw - y) < half
+    good = np.hypot(xw - x, yw - y) < np.minimum(half, 1.0)
     return np.where(good, xw, x), np.where(good, yw, y)
 
 

@@ -100,9 +100,9 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # sums, sets and what is written at a time; the exposure that is added, its noise and its light
-        bytes_per_unit=pixels**2 * ((44 if drawn else 8) + 4 * planes)
-        + (0 if drawn else max(int(np.prod(instrument.shape)) * 22, pixels**2 * 4))
-        + (350 << 20),
+        bytes_per_unit=pixels**2 * ((44 if drawn else 3) + 4 * planes)
+        + (0 if drawn else max(int(np.prod(instrument.shape)) * 22, pixels * 40_000))
+        + (300 << 20 if drawn else 150 << 20),
         # a drizzled exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 6e-8 * float(mean)),
         tables={"sets": schema("sets")},
@@ -191,7 +191,10 @@ def sets_table(
     members : exposures of each set, as numbers
     seconds, names : of each exposure
     """
-    pixels = np.bincount(planes.ravel(), minlength=len(members))
+    pixels = np.zeros(len(members), np.int64)
+    # some rows at a time: counting makes them eight bytes each
+    for first in range(0, len(planes), 256):
+        pixels += np.bincount(planes[first : first + 256].ravel(), minlength=len(members))
     rows = [(k, number) for k, chosen in enumerate(members) if pixels[k] for number in chosen]
     sets, inputs = np.array(rows, int).reshape(-1, 2).T
     return pd.DataFrame({

@@ -63,8 +63,8 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         (len(units),),
         lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        # image, error, map of objects and what sep keeps of them; some rows of all bands
-        bytes_per_unit=pixels**2 * 19 + pixels * min(pixels, 1024) * 12 * len(bands) + (250 << 20),
+        # three planes and some rows of all bands; then the map of objects, and of one band image, error, mask and noise
+        bytes_per_unit=max(pixels**2 * 12 + pixels * min(pixels, 1024) * 12 * len(bands), pixels**2 * 17) + (200 << 20),
         seconds_per_unit=pixels**2 * 1.2e-6,
         tables={"objects": schema("objects", bands)},
     )

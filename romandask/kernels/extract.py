@@ -60,7 +60,7 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
 
     An object too crowded to deblend is measured without deblending and flagged; it never ends the run.
     """
-    sep.set_extract_pixstack(5_000_000)
+    sep.set_extract_pixstack(2_000_000)
     sep.set_sub_object_limit(16_384)
     image, error, mask = layer.image, layer.error, layer.mask
     error[mask] = 1.0

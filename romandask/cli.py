@@ -21,12 +21,13 @@ from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow  # noqa: E402
 from romandask.calibration import check_files, make_files  # noqa: E402
-from romandask.export import export_meds, export_obseq, export_psf, export_truth  # noqa: E402
+from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth  # noqa: E402
 from romandask.instruments.roman_focal_plane import SCAS  # noqa: E402
 from romandask.model.config import read_yaml  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.model.sky import Cone  # noqa: E402
 from romandask.pipeline import load_pipeline, pipeline_of  # noqa: E402
+from romandask.pixfrac import advice, coverage  # noqa: E402
 from romandask.report import dag_svg, write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
 from romandask.runtime.progress import Reporter  # noqa: E402
@@ -90,6 +91,20 @@ def plan(
     if dag is not None:
         dag_svg(rows, dag)
         Console().print(f"wrote {dag}", highlight=False)
+
+
+@app.command()
+def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
+    """Show what each pixfrac does to the coadds of Roman's dithers, and recommend one; make nothing."""
+    found = coverage(Survey(load_pipeline(pipeline, overrides)).coadd_product("roman"))
+    table = Table("band", "exposures", "pixfrac", "empty pixels", "rms / median of weight", "")
+    for one in found:
+        cells = (str(one.exposures), f"{one.pixfrac:.1f}", f"{one.empty:.2%}", f"{one.uneven:.3f}")
+        table.add_row(one.band, *cells, "good" if one.good else "")
+    Console().print(table)
+    best = advice(found)
+    text = "none is good in all bands: more exposures are needed" if best is None else f"coadds.pixfrac={best:g}"
+    Console().print(text, highlight=False)
 
 
 @app.command()
@@ -241,6 +256,22 @@ def export_psf_images(
 ) -> None:
     """Write PSF images of Roman exposures (FITS): a unit star, 8 samples a pixel."""
     for path in export_psf(open_survey(store), out, exposure):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@export_app.command("coadd-psf")
+def export_coadd_psf_images(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    at: Annotated[tuple[float, float], typer.Option("--at", metavar="RA DEC", help="Degrees.")],
+    band: Annotated[list[str] | None, typer.Option("--band", help="May be repeated; default: all.")] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option("--scale", min=1e-3, help="Arcsec between samples; default: the coadd's own pixels."),
+    ] = None,
+) -> None:
+    """Write the PSF of Roman's coadds at a place: a unit star as the exposures there have it, drizzled (FITS)."""
+    for path in export_coadd_psf(open_survey(store), out, *at, band or [], scale):
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

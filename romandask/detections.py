@@ -46,7 +46,8 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     instrument, pixels = _instrument(maker), maker.pixels
     bands = instrument.bands
     state = {
-        "settings": settings.model_dump(exclude={"order"}), "bands": bands, "region": vars(region),
+        "settings": settings.model_dump(exclude={"order", "match_radius", "summary_magnitude"}),
+        "bands": bands, "region": vars(region),
         "kind": instrument.detection, "extended": EXTENDED, "aperture": instrument.aperture,
     }  # fmt: skip
     units = tuple(

@@ -86,6 +86,25 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
     return written
 
 
+def export_coadd_psf(
+    survey: Survey, path: Path, ra: float, dec: float, bands: list[str], scale: float | None
+) -> list[Path]:
+    """Write the PSF of Roman's coadds at a place (degrees), one FITS file a band, and return where they are.
+
+    Raises
+    ------
+    UserError
+        If there is no exposure of a band there, or the folder cannot be written.
+    """
+    images = {band: survey.psf(ra, dec, band, scale=scale) for band in bands or survey.instruments["roman"].bands}
+    _prepare(path)
+    written = []
+    for band, image in images.items():
+        written.append(path / f"psf-{band}-{ra:.5f}_{dec:+.5f}.fits")
+        psf_image.write_coadd(written[-1], image.values, {**image.attrs, "ra": ra, "dec": dec, "band": band})
+    return written
+
+
 def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size: int, catalog: str) -> list[Path]:
     """Write multi-epoch cutouts of objects from Roman's exposures, one MEDS file a band, and return where they are.
 

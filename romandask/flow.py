@@ -118,6 +118,11 @@ def stages(survey: Survey) -> list[Stage]:
             Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
             for name in names
         ]
+    for kind in ("truth_match", "truth_summary"):
+        found += [
+            Stage(f"{kind}/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
+            for name in names
+        ]
     for name in names:
         found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
     if {"roman", "rubin"} <= set(names):
@@ -317,7 +322,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
         failed = len(list(folder.glob("*.failed")))
         done = len(store.records(stage.name))
         known = not stage.name.startswith(
-            ("calibration", "exposures", "truth_index", "coadds", "detections", "objects", "matches", "statistics")
+            ("calibration", "exposures", "truth_", "coadds", "detections", "objects", "matches", "statistics")
         )
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)

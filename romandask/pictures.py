@@ -187,6 +187,28 @@ def size_magnitude(objects: dict[str, pd.DataFrame], bands: dict[str, str]) -> b
     return _png(figure)
 
 
+def completeness(tables: dict[str, pd.DataFrame], matched: dict[str, pd.DataFrame], bands: dict[str, str]) -> bytes:
+    """Return completeness and purity by magnitude, and measured less true magnitudes, of each survey."""
+    figure = _figure(6 * len(tables), 6.4)
+    for position, (survey, table) in enumerate(tables.items()):
+        axes = figure.add_subplot(2, len(tables), position + 1)
+        for name, colour in (("completeness", "tab:blue"), ("purity", "tab:orange")):
+            known = table[table[name].notna()]
+            axes.plot(known["magnitude"], known[name], "o-", ms=3, color=colour, label=name)
+        axes.set_ylim(0, 1.05)
+        axes.set_xlabel(f"{survey} {bands[survey]}, AB mag")
+        axes.legend(fontsize=8)
+        axes = figure.add_subplot(2, len(tables), len(tables) + position + 1)
+        frame = matched[survey]
+        axes.axhline(0, color="0.7", lw=0.8)
+        difference = frame["magnitude"] - frame["true_magnitude"]
+        axes.scatter(frame["true_magnitude"], difference, s=5, c=np.where(frame["star"], "tab:red", "0.5"))
+        axes.set_ylim(-1.5, 1.5)
+        axes.set_xlabel(f"true {bands[survey]}, AB mag")
+        axes.set_ylabel("measured less true, mag")
+    return _png(figure)
+
+
 def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
     """Return the blend matrix: log number of groups by Roman (rows) and Rubin (columns) objects."""
     shown = counts[counts.index <= 9][[c for c in counts.columns if c <= 6]]

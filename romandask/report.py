@@ -15,6 +15,7 @@ from romandask.flow import Planned, run_figures, stored_versions
 from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.survey import Survey
+from romandask.truth_match import reference_band
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2em auto; padding: 0 1em; color: #1c2430; }
@@ -172,6 +173,15 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
         + _image(
             pictures.size_magnitude(objects, middle),
             "Size and magnitude; point sources form the locus at the PSF's size.",
+        )
+        + _image(
+            pictures.completeness(
+                {name: survey.completeness(name) for name in survey.instruments},
+                {name: survey.truth_match_product(name).all_rows() for name in survey.instruments},
+                {name: reference_band(instrument) for name, instrument in survey.instruments.items()},
+            ),
+            "Objects against the truth: the share of true objects that was found, in true magnitudes, the share of "
+            "objects that are real, in measured ones; Kron magnitudes less those of the counterparts, stars in red.",
         )
     )
 

@@ -36,6 +36,7 @@ from romandask.star import Spectrum, coadd_psf
 from romandask.statistics import Statistics, matrix, statistics
 from romandask.truth import TruthCatalogs, truth
 from romandask.truth_index import truth_index
+from romandask.truth_match import completeness, reference_band, truth_match, truth_summary
 
 
 class Survey:
@@ -145,6 +146,19 @@ class Survey:
     def segmentation(self, survey: str) -> xr.Dataset:
         """Return the lazy maps of detected objects (tile, y, x): `segmentation`, the last 24 bits of objectId."""
         return self.detection_product(survey).dataset
+
+    def truth_match(self, survey: str) -> dd.DataFrame:
+        """Return the lazy true counterparts of a survey's objects (schema: catalogs/truth_match.yaml)."""
+        return self.truth_match_product(survey).frame
+
+    def truth_summary(self, survey: str) -> dd.DataFrame:
+        """Return the lazy list of true objects, found or not (schema: catalogs/truth_summary.yaml)."""
+        return self.truth_summary_product(survey).frame
+
+    def completeness(self, survey: str) -> pd.DataFrame:
+        """Return completeness and purity of a survey's objects by magnitude, in H158 of Roman or i of Rubin."""
+        tables = self.truth_summary_product(survey), self.truth_match_product(survey)
+        return completeness(*(table.all_rows() for table in tables), reference_band(self._instrument(survey)))
 
     def objects(self, survey: str) -> dd.DataFrame:
         """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
@@ -271,6 +285,20 @@ class Survey:
         """The detections of each tile."""
         settings = self.pipeline.detections
         return self._once("detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region))
+
+    def truth_match_product(self, survey: str) -> TableProduct:
+        """The true counterparts of the objects of each tile."""
+        settings = self.pipeline.detections
+        return self._once("truth_match", survey, lambda: truth_match(self.detection_product(survey), settings))
+
+    def truth_summary_product(self, survey: str) -> TableProduct:
+        """The true objects of each tile."""
+        settings = self.pipeline.detections
+        return self._once(
+            "truth_summary",
+            survey,
+            lambda: truth_summary(self.truth_match_product(survey), self.detection_product(survey), settings),
+        )
 
     def object_product(self, survey: str) -> TableProduct:
         """The object table."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,16 @@ class TruthCatalogs:
         stars = _rows_near(self.stars, ra, dec, stars_radius)
         return bind(galaxies, stars, self.library, self.edges, self.internal_frame)
 
+    def brief(self, ra: float, dec: float, radius: float, bands: Sequence[str]) -> pd.DataFrame:
+        """Return id, star, ra, dec, redshift and flux_<band> (nJy) of all objects around a cone (degrees)."""
+        fluxes = [f"flux_{band}" for band in bands]
+        galaxies = _rows_near(self.galaxies, ra, dec, radius, ["galaxy_id", "ra", "dec", "redshift", *fluxes])
+        stars = _rows_near(self.stars, ra, dec, radius, ["id", "ra", "dec", *fluxes])
+        galaxies = galaxies.rename(columns={"galaxy_id": "id"}).assign(star=False)
+        both = [galaxies, stars.assign(star=True, redshift=0.0)]
+        found = pd.concat([part for part in both if len(part)] or both, ignore_index=True)
+        return found[["id", "star", "ra", "dec", "redshift", *fluxes]]
+
     def inputs(self, ra: float, dec: float, radius: float, stars_radius: float) -> tuple[tuple[str, str], ...]:
         """Return the units that `near` reads."""
         return tuple(
@@ -66,13 +76,16 @@ class TruthCatalogs:
         )
 
 
-def _rows_near(product: TableProduct, ra: float, dec: float, radius: float) -> pd.DataFrame:
-    """Return the rows of the cells that touch a cone, sorted by their place, without the columns of fluxes."""
+def _rows_near(
+    product: TableProduct, ra: float, dec: float, radius: float, wanted: list[str] | None = None
+) -> pd.DataFrame:
+    """Return the rows of the cells that touch a cone, sorted by their place: of columns all but those of fluxes."""
     order = max(product.order or 0, NEAR_ORDER)
     cells = cells_in_cone(ra, dec, radius, order)
     home = cells >> (2 * (order - (product.order or 0)))
     shift = 2 * (29 - order)
-    columns = [name for name in product.schema.names if not name.startswith(("flux_", "dust_", "lsst_flux_"))]
+    columns = wanted or [name for name in product.schema.names if not name.startswith(("flux_", "dust_", "lsst_flux_"))]
+    columns = list(dict.fromkeys([*columns, "_healpix_29"]))
     parts = []
     for index in product.touching(np.unique(home)):
         own = cells[home == (product.pixels or ())[index]]

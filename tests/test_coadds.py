@@ -17,7 +17,9 @@ from romandask.instruments.roman import Roman, RomanSettings
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.pixel_map import pixel_map, strips
 from romandask.kernels.stack import stack
+from romandask.model.errors import UserError
 from romandask.model.tiles import tangent_header
+from romandask.pixfrac import CHOICES, SIDE, advice, coverage
 from romandask.runtime.store import Store
 
 CALLS: list[int] = []
@@ -126,6 +128,31 @@ def test_the_order_and_cut_of_strips_do_not_matter(small):
         made.append((sums.weight.copy(), *sums.means()))
     for first, second in zip(*made, strict=True):
         np.testing.assert_allclose(first, second, atol=2e-5)
+
+
+def test_pixfrac_is_advised_from_the_weights_that_the_package_gives(small):
+    """A pixfrac is good where the drizzled weight has no holes and is even."""
+    product = coadds(small.product, small.tiles, small.settings)
+    found = coverage(product)
+    assert [one.pixfrac for one in found] == CHOICES.tolist()
+    assert all(first.uneven > second.uneven for first, second in itertools.pairwise(found))
+    assert all(first.empty >= second.empty for first, second in itertools.pairwise(found))
+    one = found[4]
+    k = int(np.argmax([len(product.make.members[k, "H158"]) for k in range(len(small.tiles))]))
+    target = WCS(tangent_header(small.tiles[k].ra, small.tiles[k].dec, SIDE, 0.0575))
+    oracle = Drizzle(kernel="square", fillval="0", out_shape=(SIDE, SIDE), disable_ctx=True)
+    for exposure in small.exposures:
+        whole = pixel_map(WCS(small.roman.header(exposure)), target, slice(0, 300), slice(0, 300)).dense()
+        plane = np.ones(small.roman.shape, np.float32)
+        oracle.add_image(plane, exptime=1.0, pixmap=whole, weight_map=plane, pixfrac=one.pixfrac, in_units="cps")
+    weight = oracle.out_wht[2:-2, 2:-2]
+    assert one.uneven == pytest.approx(weight.std() / np.median(weight), rel=0.05)
+    assert one.empty == pytest.approx((weight <= 0).mean(), abs=2e-3)
+    assert advice(found) is None or advice(found) in CHOICES
+    good = [replace(one, empty=0.0, uneven=0.3 if one.pixfrac < 0.6 else 0.1) for one in found]
+    assert advice(good) == 0.6
+    with pytest.raises(UserError, match="no Roman"):
+        coverage(replace(product, make=None))
 
 
 def test_an_image_elsewhere_has_no_strips(small):

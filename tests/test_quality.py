@@ -17,7 +17,8 @@ LAYERS = [
     {"pictures", "flow"},
     {"survey"},
     {"pipeline", "statistics"},
-    {"matches", "detections", "cutouts", "effects", "star"},
+    {"truth_match"},
+    {"matches", "detections", "cutouts", "effects", "star", "pixfrac"},
     {"coadds", "tile_layers"},
     {"coadd_psfs"},
     {"truth_index", "psfs"},
@@ -110,7 +111,7 @@ def test_every_path_and_command_that_the_readme_names_exists():
     for name in re.findall(
         r"romandask (plan|run|status|report|ingest|\w+) ", " ".join(re.findall(r"^romandask .*$", text, re.M))
     ):
-        assert name in {"plan", "run", "status", "report", "ingest", "export", "calibration"}
+        assert name in {"plan", "run", "status", "report", "ingest", "export", "calibration", "pixfrac"}
 
 
 def test_ci_runs_the_test_command_of_the_readme():

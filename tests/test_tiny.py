@@ -171,3 +171,26 @@ def test_groups_hold_every_object_and_the_matrix_counts_them(survey):
 
 def test_workers_lived_within_their_memory(tiny_store):
     assert max(row["peak_bytes"] for row in run_figures(Store(tiny_store))) < 2 * 2**30
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_bright_objects_are_found_and_real(survey, name):
+    objects, matched = survey.objects(name).compute(), survey.truth_match(name).compute()
+    assert sorted(matched["objectId"]) == sorted(objects["objectId"])
+    summary = survey.truth_summary(name).compute()
+    found = summary[summary["objectId"] > 0]
+    assert set(found["objectId"]) <= set(objects["objectId"])
+    assert (found["separation"] <= 1).all()
+    counts = survey.completeness(name).set_index("magnitude")
+    bright = counts.loc[19:23]
+    assert bright["found"].sum() / bright["true"].sum() > 0.85
+    assert bright["real"].sum() / bright["objects"].sum() > 0.95
+
+
+def test_the_map_of_objects_has_the_objects_of_the_table(survey):
+    segments = survey.segmentation("roman")["segmentation"].isel(tile=0).values
+    objects = survey.detection_product("roman").load(0, ("objects",))["objects"]
+    label = objects["objectId"].to_numpy() & 0xFFFFFF
+    assert set(label) <= set(np.unique(segments))
+    x, y = (np.rint(objects[name]).astype(int) for name in ("x", "y"))
+    assert (segments[y, x] == label).mean() > 0.9

@@ -29,3 +29,24 @@ def write(path: Path, image: np.ndarray, oversampling: int, pixel_scale: float, 
     header["CRPIX1"] = (image.shape[1] // 2 + 1, "sample on which the star is centred")
     header["CRPIX2"] = (image.shape[0] // 2 + 1, "sample on which the star is centred")
     hdu.writeto(path, overwrite=True, checksum=True)
+
+
+def write_coadd(path: Path, image: np.ndarray, place: dict) -> None:
+    """Write the PSF image (side, side) of a coadd at a place to the first HDU.
+
+    Parameters
+    ----------
+    place : ra, dec (degrees), band, tile, exposures (names), pixel_scale (arcsec), x and y (pixels, from 0) of the star
+    """
+    hdu = fits.PrimaryHDU(np.asarray(image, np.float32))
+    header = hdu.header
+    header["RA"], header["DEC"] = (float(place["ra"]), "degrees"), (float(place["dec"]), "degrees")
+    header["FILTER"] = (str(place["band"]), "band")
+    header["TILE"] = (str(place["tile"]), "tile of the coadd")
+    header["PIXSCALE"] = (float(place["pixel_scale"]), "arcsec between samples")
+    header["BUNIT"] = ("1/pixel", "share of a unit star's light in a coadd pixel")
+    header["CRPIX1"] = (float(place["x"]) + 1, "where the star is centred")
+    header["CRPIX2"] = (float(place["y"]) + 1, "where the star is centred")
+    for number, name in enumerate(place["exposures"]):
+        header[f"EXP{number:05d}"] = (name, "exposure: band, visit, SCA")
+    hdu.writeto(path, overwrite=True, checksum=True)

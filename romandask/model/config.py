@@ -131,6 +131,8 @@ class DetectionSettings(Section):
     min_area: int = Field(5, ge=1, description="least number of connected pixels")
     deblend_levels: int = Field(48, ge=1)
     deblend_contrast: float = Field(0.05, ge=0)
+    match_radius: float = Field(1.0, gt=0, le=10, description="of an object's true counterpart, arcsec")
+    summary_magnitude: float = Field(28.0, description="true objects fainter than this (H158, i) are not summarised")
     min_snr: float = Field(5.0, ge=0, description="least signal to noise in the detection image")
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the object tables' partitions")
 

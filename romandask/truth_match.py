@@ -1,0 +1,162 @@
+"""Detected objects and the true ones: the counterpart of each object of a tile, and what was found of the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from romandask.coadds import DrawTile, DrizzleTile
+from romandask.detections import DetectTile, owned
+from romandask.exposures import RenderExposure
+from romandask.instruments.exposure import Instrument
+from romandask.kernels.counterparts import counterparts
+from romandask.model.config import DetectionSettings
+from romandask.model.sky import unit_vectors
+from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.schemas import schema
+from romandask.runtime.units import Unit
+
+BINS = np.arange(17.0, 30.01, 0.5)
+"""Magnitudes between which completeness and purity are counted."""
+
+
+def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
+    """Return the lazy counterparts of the objects of each tile (schema: catalogs/truth_match.yaml), a unit a tile."""
+    maker, tiles, render = _makers(detections)
+    units = tuple(
+        Unit(
+            tile.name,
+            {"tile": tile.name, "radius": settings.match_radius, "band": reference_band(render.instrument)},
+            ((detections.stage, tile.name), *render.truth.inputs(*_cone(tiles, k))),
+        )
+        for k, tile in enumerate(tiles.tiles)
+    )
+    return TableProduct(
+        f"truth_match/{render.instrument.name}", units, MatchTile(detections, settings), schema("truth_match"),
+        bytes_per_unit=600 << 20, seconds_per_unit=5.0,
+    )  # fmt: skip
+
+
+def truth_summary(matched: TableProduct, detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
+    """Return the lazy list of the true objects of each tile, found or not (schema: catalogs/truth_summary.yaml)."""
+    _, tiles, render = _makers(detections)
+    bands = render.instrument.bands
+    units = tuple(
+        Unit(
+            tile.name,
+            {"tile": tile.name, "faintest": settings.summary_magnitude, "bands": bands},
+            ((matched.stage, tile.name), *render.truth.inputs(*_cone(tiles, k))),
+        )
+        for k, tile in enumerate(tiles.tiles)
+    )
+    return TableProduct(
+        f"truth_summary/{render.instrument.name}", units, SummariseTile(matched, detections, settings),
+        schema("truth_summary", bands), bytes_per_unit=600 << 20, seconds_per_unit=5.0,
+    )  # fmt: skip
+
+
+def reference_band(instrument: Instrument) -> str:
+    """Return the band in which magnitudes are compared: H158 of Roman, i of Rubin, or the middle one."""
+    bands = instrument.bands
+    return next((band for band in ("H158", "i") if band in bands), bands[len(bands) // 2])
+
+
+def completeness(summary: pd.DataFrame, matched: pd.DataFrame, band: str) -> pd.DataFrame:
+    """Return, by magnitude: true objects, found, completeness; objects, real ones, purity.
+
+    Completeness is counted in true magnitudes, purity in measured ones.
+    """
+    true = np.asarray(_magnitude(summary[f"flux_{band}"]))
+    found = summary["objectId"].to_numpy() > 0
+    measured, real = matched["magnitude"].to_numpy(float), matched["truth_id"].to_numpy() >= 0
+    counts = [np.histogram(values, BINS)[0] for values in (true, true[found], measured, measured[real])]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return pd.DataFrame({
+            "magnitude": (BINS[1:] + BINS[:-1]) / 2, "true": counts[0], "found": counts[1],
+            "completeness": counts[1] / counts[0], "objects": counts[2], "real": counts[3],
+            "purity": counts[3] / counts[2],
+        })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MatchTile:
+    """Makes the counterparts of one tile."""
+
+    detections: ImageProduct
+    settings: DetectionSettings
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        """Return one row for each object (schema: catalogs/truth_match.yaml)."""
+        _, tiles, render = _makers(self.detections)
+        band = reference_band(render.instrument)
+        objects = self.detections.load(index, ("objects",))["objects"]
+        true = render.truth.brief(*_cone(tiles, index)[:3], (band,))
+        magnitude = _magnitude(objects[f"{band}_kronFlux"])
+        found = counterparts(
+            unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy()), magnitude,
+            unit_vectors(true["ra"].to_numpy(), true["dec"].to_numpy()), _magnitude(true[f"flux_{band}"]),
+            np.radians(self.settings.match_radius / 3600),
+        )  # fmt: skip
+        none = found.row < 0
+        rows = true.iloc[np.where(none, 0, found.row)] if len(true) else true.reindex(range(len(objects)))
+        return pd.DataFrame({
+            "objectId": objects["objectId"].to_numpy(),
+            "truth_id": np.where(none, -1, rows["id"].fillna(-1).to_numpy()).astype(np.int64),
+            "star": np.where(none, False, rows["star"].fillna(False).to_numpy(bool)),
+            "separation": np.degrees(found.separation) * 3600, "candidates": found.candidates.astype(np.int32),
+            "magnitude": magnitude,
+            "true_magnitude": np.where(none, np.nan, _magnitude(rows[f"flux_{band}"])),
+        })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SummariseTile:
+    """Makes the list of true objects of one tile."""
+
+    matched: TableProduct
+    detections: ImageProduct
+    settings: DetectionSettings
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        """Return one row for each true object (schema: catalogs/truth_summary.yaml)."""
+        maker, tiles, render = _makers(self.detections)
+        bands, band = render.instrument.bands, reference_band(render.instrument)
+        true = render.truth.brief(*_cone(tiles, index)[:3], bands)
+        tile, grid = tiles.tiles[index], tiles.settings.grid()
+        here = owned(true["ra"].to_numpy(), true["dec"].to_numpy(), tile, grid, maker.region)
+        true = true[here & (_magnitude(true[f"flux_{band}"]) < self.settings.summary_magnitude)]
+        matched = self.matched.load(index)
+        matched = matched[matched["truth_id"] >= 0].sort_values(["separation", "objectId"])
+        key = ["truth_id", "star"]
+        number = matched.groupby(key).size().rename("objects").reset_index()
+        nearest = matched.drop_duplicates(key)[[*key, "objectId", "separation"]].merge(number, on=key)
+        joined = true.merge(nearest, how="left", left_on=["id", "star"], right_on=key).drop(columns="truth_id")
+        joined = joined.rename(columns={"id": "truth_id"})
+        joined["objectId"] = joined["objectId"].fillna(0).astype(np.int64)
+        joined["objects"] = joined["objects"].fillna(0).astype(np.int32)
+        return joined[schema("truth_summary", bands).names]
+
+
+def _makers(detections: ImageProduct) -> tuple[DetectTile, DrawTile | DrizzleTile, RenderExposure]:
+    maker = detections.make
+    assert isinstance(maker, DetectTile)
+    tiles = maker.coadds.make
+    assert isinstance(tiles, DrizzleTile | DrawTile)
+    render = tiles.exposures.make
+    assert isinstance(render, RenderExposure)
+    return maker, tiles, render
+
+
+def _cone(tiles: DrawTile | DrizzleTile, index: int) -> tuple[float, float, float, float]:
+    """Return centre and radii (degrees) of the cone around the unique area of a tile, for galaxies and stars."""
+    tile, grid = tiles.tiles[index], tiles.settings.grid()
+    radius = (grid.inner / np.sqrt(2) + 5) / 3600
+    return tile.ra, tile.dec, radius, radius
+
+
+def _magnitude(flux: pd.Series) -> np.ndarray:
+    """Return AB magnitudes of fluxes in nJy; NaN where there is no light."""
+    values = flux.to_numpy(float)
+    return np.where(values > 0, 31.4 - 2.5 * np.log10(np.where(values > 0, values, 1)), np.nan)

@@ -90,7 +90,6 @@ def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets
     height, width = total.shape
     step = knots[1] - knots[0]
     cells = np.zeros((_window(lower, upper, step), _window(lower, upper, step) + 2))
-    values, known = np.empty(len(images), np.float32), len(follow)
     # column after column of pieces of rows: what one falls on the next falls on too, and it is still in cache
     for piece in range(len(knots) - 1):
         begin = max(int(np.ceil(knots[piece])) - first, 0)
@@ -118,29 +117,27 @@ def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets
                 _side(cells, bx - left, by - bottom, cx - left, cy - bottom)
                 _side(cells, cx - left, cy - bottom, dx - left, dy - bottom)
                 _side(cells, dx - left, dy - bottom, ax - left, ay - bottom)
-                for plane in range(len(images)):
-                    values[plane] = given * images[plane][row, column]
                 x0, y0, columns = int(left), int(bottom), int(right - left) + 1
-                within = x0 >= 0 and y0 >= 0 and right < width and top < height
                 for j in range(int(top - bottom) + 1):
                     covered = 0.0
                     y = y0 + j
                     for i in range(columns):
                         covered += cells[j, i]
                         cells[j, i] = 0
-                        share = np.float32(abs(covered))
+                        share = abs(covered)
                         x = x0 + i
-                        if share < _LEAST or not (within or (0 <= y < height and 0 <= x < width)):
+                        if share < _LEAST or y < 0 or y >= height or x < 0 or x >= width:
                             continue
-                        total[y, x] += given * share
+                        part = given * np.float32(share)
+                        total[y, x] += part
                         for plane in range(len(images)):
-                            sums[plane][y, x] += share * values[plane]
+                            sums[plane][y, x] += part * images[plane][row, column]
                         old = sets[y, x]
-                        if old < known:
+                        if old < len(follow):
                             if follow[old] < 0:
                                 if count >= len(parents):
                                     return -1
-                                follow[old] = known + count
+                                follow[old] = len(follow) + count
                                 parents[count] = old
                                 count += 1
                             sets[y, x] = follow[old]

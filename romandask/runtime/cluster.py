@@ -121,7 +121,9 @@ class OnCluster:
                 elif tries[task.index] < ATTEMPTS and not failed.intersection(task.after):
                     waiting.again(task)
                 else:
-                    yield Outcome(task.index, None, _failure(future))
+                    before = failed.intersection(task.after)
+                    text = _after_failed(product, min(before)) if before else _failure(future)
+                    yield Outcome(task.index, None, text)
                     given_up = _given_up(product, task.index, waiting)
                     failed |= {task.index, *(outcome.index for outcome in given_up)}
                     yield from given_up
@@ -150,8 +152,12 @@ class OnCluster:
 
 
 def _given_up(product: ImageProduct | TableProduct, failed: int, waiting: Waiting) -> list[Outcome]:
-    text = f"{product.names[failed]}, which comes before it, failed\n"
+    text = _after_failed(product, failed)
     return [Outcome(task.index, None, text) for task in waiting.give_up(failed)]
+
+
+def _after_failed(product: ImageProduct | TableProduct, failed: int) -> str:
+    return f"{product.names[failed]}, which comes before it, failed\n"
 
 
 def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:

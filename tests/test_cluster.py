@@ -1,0 +1,54 @@
+"""Runners: units that come after others, and what becomes of them when one fails."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+
+from romandask.runtime.cluster import ATTEMPTS, runner
+from romandask.runtime.products import TableProduct
+from romandask.runtime.store import Store
+from romandask.runtime.units import Unit
+from romandask.runtime.work import Task
+
+
+@dataclass(frozen=True)
+class Failing:
+    """Makes a row of each unit, counts how often it is asked, and fails for some."""
+
+    folder: Path
+    bad: tuple[int, ...]
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        tried = self.folder / f"{index}.tried"
+        with tried.open("a") as file:
+            file.write("x")
+        if index in self.bad:
+            raise ArithmeticError(f"unit {index} cannot be made")
+        return pd.DataFrame({"number": np.array([index], np.int64)})
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_units_after_one_that_fails_are_given_up_and_named_and_others_are_made(tmp_path, workers):
+    maker = Failing(tmp_path, (1,))
+    units = tuple(Unit(f"u{k}", k) for k in range(6))
+    product = TableProduct("table/x", units, maker, pa.schema([("number", pa.int64())]))
+    # 1 fails; 2 and 4 come after it, 3 after 2; 0 and 5 have nothing to do with it, 5 comes after 0
+    after = {2: (1,), 3: (2,), 4: (1, 0), 5: (0,)}
+    tasks = [Task(k, "inputs", 1.0, "", after.get(k, ())) for k in range(6)]
+    store = Store(tmp_path / "store")
+    with runner(workers, 1.5) as execution:
+        outcomes = {outcome.index: outcome for outcome in execution.run(product, tasks, store)}
+    assert sorted(outcomes) == [0, 1, 2, 3, 4, 5]
+    assert {k for k, outcome in outcomes.items() if outcome.record is None} == {1, 2, 3, 4}
+    assert "ArithmeticError: unit 1 cannot be made" in outcomes[1].failure
+    for k in (2, 3, 4):
+        assert not (tmp_path / f"{k}.tried").exists(), "what comes after it is not even tried"
+        assert "u1" in outcomes[k].failure or "u2" in outcomes[k].failure
+    tries = len((tmp_path / "1.tried").read_text())
+    assert tries == (ATTEMPTS if workers else 1)
+    for k in (0, 5):
+        assert product.stored(store).load(k)["number"].tolist() == [k]

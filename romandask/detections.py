@@ -29,6 +29,7 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands
+from romandask.zero_points import corrected
 
 EXTENDED = 1.15
 """Half-light radius over the PSF's above which an object counts as extended."""
@@ -72,9 +73,18 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
 
 
 def objects(
-    detections: ImageProduct, coadds: ImageProduct, settings: DetectionSettings, region: Region
+    detections: ImageProduct,
+    coadds: ImageProduct,
+    settings: DetectionSettings,
+    region: Region,
+    zero: TableProduct | None = None,
 ) -> TableProduct:
-    """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS)."""
+    """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS).
+
+    Parameters
+    ----------
+    zero : offsets of the magnitudes (`zero_points()`), to be taken out; None leaves fluxes as they were measured
+    """
     maker = coadds.make
     assert isinstance(maker, DrizzleTile | DrawTile)
     radius = maker.settings.grid().inner / 3600 * 0.75
@@ -88,7 +98,7 @@ def objects(
         Unit(
             f"{settings.order}-{cell}",
             {"order": settings.order, "cell": cell},
-            tuple((detections.stage, detections.names[k]) for k in members),
+            (*((detections.stage, detections.names[k]) for k in members), *(((zero.stage, "all"),) if zero else ())),
         )
         for cell, members in tiles_of.items()
     )
@@ -96,7 +106,7 @@ def objects(
     return TableProduct(
         f"objects/{name}",
         units,
-        CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order),
+        CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
         detections.tables["objects"],
         tuple(tiles_of),
         settings.order,
@@ -188,6 +198,7 @@ class CollectPartition:
     cells: tuple[int, ...]
     members: tuple[tuple[int, ...], ...]
     order: int
+    zero: TableProduct | None = None
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the objects of the partition, by _healpix_29."""
@@ -197,7 +208,8 @@ class CollectPartition:
         filled = [part for part in parts if len(part)]
         if not filled:
             return self.detections.tables["objects"].empty_table().to_pandas()
-        return pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
+        found = pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
+        return found if self.zero is None else corrected(found, self.zero.load(0))
 
 
 def _instrument(maker: DrizzleTile | DrawTile) -> Instrument:

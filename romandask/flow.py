@@ -118,7 +118,7 @@ def stages(survey: Survey) -> list[Stage]:
             Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
             for name in names
         ]
-    for kind in ("truth_match", "truth_summary"):
+    for kind in ("truth_match", "truth_summary", "zero_points"):
         found += [
             Stage(f"{kind}/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
             for name in names
@@ -273,6 +273,7 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
             blocked.append(unit.name)
             store.record(product.stage, unit.name).unlink(missing_ok=True)
             continue
+        upstream += [output(source) for source in unit.optional]
         inputs = digest(product.stage, unit.settings, version("romandask"), upstream)
         record = read_record(store, product.stage, unit.name)
         if record is not None and record.inputs == inputs:
@@ -322,7 +323,17 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
         failed = len(list(folder.glob("*.failed")))
         done = len(store.records(stage.name))
         known = not stage.name.startswith(
-            ("calibration", "exposures", "truth_", "coadds", "detections", "objects", "matches", "statistics")
+            (
+                "calibration",
+                "exposures",
+                "truth_",
+                "zero_points",
+                "coadds",
+                "detections",
+                "objects",
+                "matches",
+                "statistics",
+            )
         )
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)

@@ -37,6 +37,7 @@ from romandask.statistics import Statistics, matrix, statistics
 from romandask.truth import TruthCatalogs, truth
 from romandask.truth_index import truth_index
 from romandask.truth_match import completeness, reference_band, truth_match, truth_summary
+from romandask.zero_points import zero_points
 
 
 class Survey:
@@ -293,21 +294,21 @@ class Survey:
 
     def truth_summary_product(self, survey: str) -> TableProduct:
         """The true objects of each tile."""
-        settings = self.pipeline.detections
-        return self._once(
-            "truth_summary",
-            survey,
-            lambda: truth_summary(self.truth_match_product(survey), self.detection_product(survey), settings),
-        )
+        matched, settings = self.truth_match_product(survey), self.pipeline.detections
+        found = self.detection_product(survey)
+        return self._once("truth_summary", survey, lambda: truth_summary(matched, found, settings))
+
+    def zero_points_product(self, survey: str) -> TableProduct:
+        """The offsets of an instrument's magnitudes, from its stars."""
+        bands = self._instrument(survey).bands
+        tables = self.truth_summary_product(survey), self.truth_match_product(survey)
+        return self._once("zero_points", survey, lambda: zero_points(*tables, self.detection_product(survey), bands))
 
     def object_product(self, survey: str) -> TableProduct:
         """The object table."""
-        settings = self.pipeline.detections
-        return self._once(
-            "objects",
-            survey,
-            lambda: objects(self.detection_product(survey), self.coadd_product(survey), settings, self.region),
-        )
+        found, settings = self.detection_product(survey), self.pipeline.detections
+        zero, tiles = self.zero_points_product(survey), self.coadd_product(survey)
+        return self._once("objects", survey, lambda: objects(found, tiles, settings, self.region, zero))
 
     @property
     def match_products(self) -> Matches:

@@ -131,7 +131,9 @@ class SummariseTile:
         matched = matched[matched["truth_id"] >= 0].sort_values(["separation", "objectId"])
         key = ["truth_id", "star"]
         number = matched.groupby(key).size().rename("objects").reset_index()
-        nearest = matched.drop_duplicates(key)[[*key, "objectId", "separation"]].merge(number, on=key)
+        # whole numbers stay whole where some are missing: as floats their last digits would go
+        whole = matched.astype({"objectId": "Int64"})
+        nearest = whole.drop_duplicates(key)[[*key, "objectId", "separation"]].merge(number, on=key)
         joined = true.merge(nearest, how="left", left_on=["id", "star"], right_on=key).drop(columns="truth_id")
         joined = joined.rename(columns={"id": "truth_id"})
         joined["objectId"] = joined["objectId"].fillna(0).astype(np.int64)

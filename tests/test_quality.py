@@ -19,7 +19,7 @@ LAYERS = [
     {"pipeline", "statistics"},
     {"truth_match"},
     {"matches", "detections", "cutouts", "effects", "star", "pixfrac"},
-    {"coadds", "tile_layers"},
+    {"coadds", "tile_layers", "zero_points"},
     {"coadd_psfs"},
     {"truth_index", "psfs"},
     {"exposures"},

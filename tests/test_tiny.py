@@ -194,3 +194,17 @@ def test_the_map_of_objects_has_the_objects_of_the_table(survey):
     assert set(label) <= set(np.unique(segments))
     x, y = (np.rint(objects[name]).astype(int) for name in ("x", "y"))
     assert (segments[y, x] == label).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_magnitudes_are_calibrated_on_the_stars_there_are(survey, name):
+    zero = survey.zero_points_product(name).load(0)
+    assert len(zero) == 3 * len(survey.instruments[name].bands)
+    assert (np.abs(zero["offset"]) < 0.5).all()
+    first = zero.iloc[0]
+    column = f"{first['band']}_{first['flux']}"
+    objects = survey.objects(name).compute().set_index("objectId")[column]
+    product = survey.detection_product(name)
+    measured = pd.concat([product.load(k, ("objects",))["objects"] for k in range(len(product.units))])
+    measured = measured.set_index("objectId")[column]
+    np.testing.assert_allclose(objects, measured.reindex(objects.index) * 10 ** (0.4 * first["offset"]), rtol=1e-5)

@@ -21,6 +21,8 @@ class Unit:
     """Relative time, so that long units go first."""
     after: tuple[str, ...] = ()
     """Units of the same stage that must be there before it; `settings` and `inputs` say what it takes from them."""
+    optional: tuple[tuple[str, str], ...] = ()
+    """Upstream units that it reads where they are there, and can be made without."""
     kin: str = ""
     """Units of one kin are made one after another: what a worker keeps for the one it has for the next."""
 

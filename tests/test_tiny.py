@@ -5,10 +5,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from astropy.io import fits
 from conftest import command
 from scipy.spatial import cKDTree
 
 import romandask as rd
+from romandask.exposures import wcs_of
 from romandask.flow import run_figures
 from romandask.formats.spectra import galaxy_templates
 from romandask.instruments.exposure import exposure_of
@@ -208,3 +210,24 @@ def test_magnitudes_are_calibrated_on_the_stars_there_are(survey, name):
     measured = pd.concat([product.load(k, ("objects",))["objects"] for k in range(len(product.units))])
     measured = measured.set_index("objectId")[column]
     np.testing.assert_allclose(objects, measured.reindex(objects.index) * 10 ** (0.4 * first["offset"]), rtol=1e-5)
+
+
+def test_the_psf_of_the_coadds_is_written_for_other_tools(survey, tiny_store, tmp_path):
+    place = (53.03, -40.007)
+    done = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", *map(str, place), "--band", "H158")
+    assert done.returncode == 0, done.stderr
+    (path,) = tmp_path.glob("*.fits")
+    image, header = fits.getdata(path), fits.getheader(path)
+    asked = survey.psf(*place, "H158")
+    np.testing.assert_array_equal(image, asked.values)
+    assert [header[f"EXP{k:05d}"] for k in range(len(asked.attrs["exposures"]))] == asked.attrs["exposures"]
+    assert header["CRPIX1"] - 1 == pytest.approx(asked.attrs["x"])
+    # the exposures are those of the set of the pixel there
+    coadd = survey.coadds("roman").sel(band="H158")
+    tile = int(np.flatnonzero(coadd["tile"].values == header["TILE"])[0])
+    column, row = wcs_of(str(coadd["header"].values[tile])).all_world2pix(*place, 0)
+    count = coadd["nimages"].isel(tile=tile, y=int(np.rint(row)), x=int(np.rint(column)))
+    assert int(count) == len(asked.attrs["exposures"])
+    wrong = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", "10", "10")
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("error: (10.0, 10.0): outside the tiles")

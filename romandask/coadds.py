@@ -63,6 +63,9 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
     shared = {**settings.model_dump(), "instrument": instrument.name, "seed": render.seed}
     if drawn:
         shared |= render.render.model_dump()
+    else:
+        # the arrays are as long as the busiest tile's are: another length, and all are made again
+        shared["inputs"] = most_inputs(members)
     keys = tuple(members)
 
     def unit(index: int) -> Unit:
@@ -176,8 +179,8 @@ class DrizzleTile:
 
 
 def most_inputs(members: dict[tuple[int, str], np.ndarray]) -> int:
-    """Return the most exposures that any tile has in any band, one at least."""
-    return max(1, *(len(chosen) for chosen in members.values()))
+    """Return room for the exposures of any tile in any band: a multiple of 16, so that it seldom changes."""
+    return 16 * max(1, *(-(-len(chosen) // 16) for chosen in members.values()))
 
 
 def sets_table(

@@ -142,22 +142,25 @@ class DrizzleTile:
         tile, band = self.tiles[k], instrument.bands[b]
         scale = instrument.coadd_scale
         target = WCS(tile.header(self.pixels, scale))
-        members = self.members[k, band]
-        sums = Sums((self.pixels, self.pixels), 1 + self.settings.noise, self.settings.pixfrac)
-        side = psf_side(instrument)
-        psfs = np.zeros((most_inputs(self.members), side, side), np.float32)
-        for number, i in enumerate(members):
-            exposure = exposure_of(source.table.iloc[i])
-            header = instrument.header(exposure)
-            wcs = WCS(header)
-            parts = strips(wcs, instrument.shape, target, (self.pixels, self.pixels))
+        members, shape = self.members[k, band], (self.pixels, self.pixels)
+        exposures = [exposure_of(source.table.iloc[i]) for i in members]
+        headers = [instrument.header(exposure) for exposure in exposures]
+        parts = [strips(WCS(header), instrument.shape, target, shape) for header in headers]
+        # before the sums take their memory: sampling a PSF takes half a gigabyte for a moment
+        psfs = np.zeros((most_inputs(self.members), *[psf_side(instrument)] * 2), np.float32)
+        for number, (exposure, header) in enumerate(zip(exposures, headers, strict=True)):
+            if parts[number]:
+                psfs[number] = input_psf(
+                    instrument, exposure, WCS(header), tile.ra, tile.dec, self.settings.pixfrac
+                )  # fmt: skip
+        sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac)
+        for i, exposure, header, part in zip(members, exposures, headers, parts, strict=True):
             planes: Iterable = []
-            if parts:
+            if part:
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
                 planes = _planes_of(
-                    arrays, parts, instrument, exposure, header, target, source.seed, self.settings.noise
+                    arrays, part, instrument, exposure, header, target, source.seed, self.settings.noise
                 )
-                psfs[number] = input_psf(instrument, exposure, wcs, tile.ra, tile.dec, self.settings.pixfrac)
             sums.add(planes)
         seconds = source.table.iloc[members]["exptime"].to_numpy(float)
         sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import uuid
@@ -184,11 +185,11 @@ def open_images(
 
 
 def write_array(array: zarr.Array, place: tuple[int, ...], values: np.ndarray) -> None:
-    """Write the values of one unit, some rows of shards at a time."""
+    """Write the values of one unit, a file of its last two axes after another: what is written is in memory twice."""
     files = (array.shards or array.chunks)[len(place) :]
-    rows = files[-2] if len(files) > 1 else files[0]
-    for first in range(0, values.shape[-2] if len(files) > 1 else 1, rows):
-        part = (..., slice(first, first + rows), slice(None)) if len(files) > 1 else (...,)
+    cuts = [range(0, length, step) for length, step in zip(values.shape[-2:], files[-2:], strict=True)]
+    for corner in itertools.product(*cuts):
+        part: Any = (..., *(slice(low, low + step) for low, step in zip(corner, files[-2:], strict=True)))
         array[(*place, *part)] = values[part]
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 import sep
 from astropy.wcs import WCS
 
-from romandask.coadd_psfs import input_psf, psf_side
+from romandask.coadd_psfs import give_back, input_psf, psf_side
 from romandask.exposures import RenderExposure, cone, empty_variance, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.detector import noise_realisation, usable
@@ -153,6 +153,7 @@ class DrizzleTile:
                 psfs[number] = input_psf(
                     instrument, exposure, WCS(header), tile.ra, tile.dec, self.settings.pixfrac
                 )  # fmt: skip
+        give_back()
         sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac)
         for i, exposure, header, part in zip(members, exposures, headers, parts, strict=True):
             planes: Iterable = []
@@ -288,6 +289,9 @@ def _planes_of(
     """Yield, for each strip, image and noise realisations in nJy/arcsec2, weight and map onto the tile."""
     good = usable(arrays["dq"])
     light = subtract_background(arrays["image"], ~good)
+    if "variance" not in arrays:
+        # nothing asks for it any more
+        del arrays["image"]
     to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
     identity = ("noise", instrument.name, exposure.visit, exposure.detector)
     wcs = WCS(header)

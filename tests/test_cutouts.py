@@ -151,7 +151,7 @@ def test_cutouts_of_coadds_are_pixels_of_the_tiles(small, objects):
     low, left = max(row, 0), max(column, 0)
     whole = product.load(k)["image"][low : row + SIZE, left : column + SIZE]
     np.testing.assert_array_equal(one["image"][0, low - row :, left - column :][: len(whole), : whole.shape[1]], whole)
-    with pytest.raises(UserError, match="layer 'psf': coadds/roman has image, weight, noise, nimages"):
+    with pytest.raises(UserError, match="layer 'psf': coadds/roman has image, weight, nimages, set"):
         cutouts(product, objects, ("psf",))
 
 

@@ -153,7 +153,7 @@ def cutouts(
     if not 8 <= size <= LARGEST or size % 2:
         raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST}")
     chosen = np.flatnonzero(np.isin(frames.bands, bands or known))
-    planes = {v.name: (v.dtype, v.attributes) for v in product.variables if v.axes == ("y", "x")}
+    planes = {v.name: (v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
     if isinstance(product.make, RenderExposure):
         planes |= {name: (kind, {"units": u, "long_name": t}) for name, (kind, u, t) in EXPOSURE_LAYERS.items()}
     for layer in layers:
@@ -275,7 +275,7 @@ class Cut:
         """Return the layers (n, size, size) of an image."""
         unit, (at, corners) = int(self.units[number]), self.places[number]
         maker = self.product.make
-        own = {v.name: v.shape for v in self.product.variables if v.axes == ("y", "x")}
+        own = {v.name: v.shape[-2:] for v in self.product.variables if v.axes[-2:] == ("y", "x")}
         shape = next(iter(own.values()))
         low = np.clip(corners.min(axis=0), 0, np.array(shape[::-1]))
         high = np.clip(corners.max(axis=0) + self.size, 0, np.array(shape[::-1]))
@@ -284,6 +284,8 @@ class Cut:
         if "weight" in self.layers:
             wanted |= {"dq", "image", "variance"}
         arrays = self.product.load(unit, tuple(sorted(wanted & set(own))), window) if wanted else {}
+        # of planes that there are several of, noise realisations, the first
+        arrays = {name: plane if plane.ndim == 2 else plane[0] for name, plane in arrays.items()}
         made = {}
         if isinstance(maker, RenderExposure):
             arrays |= self._expected(maker, unit, window, arrays)

@@ -136,13 +136,13 @@ class ScaReadout:
                 if name not in last:
                     last[name] = 0, read(name, ())
                 return last[name][1]
-            before_rows = (slice(None),) * (len(axes[name]) - 2)
+            everything = slice(None)
             if rows == slice(None) or rows.start // _STORED != (rows.stop - 1) // _STORED:
-                return read(name, (*before_rows, rows))
+                return read(name, (rows, everything))
             part = rows.start // _STORED
             if name not in last or last[name][0] != part:
                 last.pop(name, None)
-                last[name] = part, read(name, (*before_rows, slice(part * _STORED, (part + 1) * _STORED)))
+                last[name] = part, read(name, (slice(part * _STORED, (part + 1) * _STORED), everything))
             first = part * _STORED
             return last[name][1][..., rows.start - first : rows.stop - first, :]
 

@@ -105,7 +105,7 @@ class Survey:
         Parameters
         ----------
         of : ids of objects; or a region or cone, for all objects in it; or a table with columns id, ra, dec
-        layers : image, truth, dq, background, weight, psf of exposures; image, weight, nimages, set of coadds
+        layers : image, truth, dq, background, weight, psf of exposures; image, weight, noise, nimages of coadds
         bands : None for all
         size : pixels a side, even
         catalog : whose objects: truth (galaxies and stars), or an instrument's object table

@@ -33,7 +33,8 @@ class TileBands:
         index = self.tile * len(self.instrument.bands) + self.instrument.bands.index(band)
         if index not in self.made and not self.coadds.has(index):
             self.made[index] = self.coadds.load(index)
-        windows = {name: {"psf": (), "noise": (slice(0, 1), rows)}.get(name, (rows,)) for name in names}
+        part = (rows, slice(None))
+        windows = {name: {"psf": (), "noise": (slice(0, 1), *part)}.get(name, part) for name in names}
         if index in self.made:
             found = {name: self.made[index][name][window].copy() for name, window in windows.items()}
         else:

@@ -138,7 +138,7 @@ def test_objects_that_no_image_sees_have_no_cutouts(small):
 
 def test_cutouts_of_coadds_are_pixels_of_the_tiles(small, objects):
     product = coadds(small.product, small.tiles[:2], small.settings)
-    lazy = cutouts(product, objects.reset_index(drop=True), ("image", "weight"), size=SIZE)
+    lazy = cutouts(product, objects.reset_index(drop=True), ("image", "weight", "noise"), size=SIZE)
     assert lazy.sizes["cutout"] > 0
     for n in range(lazy.sizes["cutout"]):
         one = lazy.isel(cutout=n)
@@ -151,7 +151,9 @@ def test_cutouts_of_coadds_are_pixels_of_the_tiles(small, objects):
     low, left = max(row, 0), max(column, 0)
     whole = product.load(k)["image"][low : row + SIZE, left : column + SIZE]
     np.testing.assert_array_equal(one["image"][0, low - row :, left - column :][: len(whole), : whole.shape[1]], whole)
-    with pytest.raises(UserError, match="layer 'psf': coadds/roman has image, weight, nimages, set"):
+    noise = product.load(k)["noise"][0, low : row + SIZE, left : column + SIZE]
+    np.testing.assert_array_equal(one["noise"][0, low - row :, left - column :][: len(noise), : noise.shape[1]], noise)
+    with pytest.raises(UserError, match="layer 'psf': coadds/roman has image, weight, noise, nimages"):
         cutouts(product, objects, ("psf",))
 
 

@@ -86,7 +86,7 @@ class ImageProduct:
         return self.store is not None and read_record(self.store, self.stage, self.names[index]) is not None
 
     def load(self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()) -> dict[str, Any]:
-        """Return the arrays of a unit, or a window of them: read where the manifest has it, made where not.
+        """Return the arrays of a unit, or a window of their last axes: read where the manifest has it, made where not.
 
         Tables of the unit are among them, whole, where `names` has theirs.
         """
@@ -98,10 +98,10 @@ class ImageProduct:
             found = {name: to_frame(read_parquet(path)) for name, path in beside.items()}
             return {**{name: read(name, window) for name in wanted}, **found}
         made = self.make(index)
-        return {**{name: made[name][window] for name in wanted}, **{name: made[name] for name in tables}}
+        return {**{name: made[name][(..., *window)] for name in wanted}, **{name: made[name] for name in tables}}
 
     def reader(self, unit: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
-        """Return what reads a window of an array of a stored unit: arrays are opened once, however many windows."""
+        """Return what reads windows of the last axes of arrays of a stored unit: each is opened once."""
         assert self.store is not None
         group = zarr.open_group(self.store.images(self.stage), mode="r")
         place = self._place(unit)
@@ -110,7 +110,7 @@ class ImageProduct:
         def read(name: str, window: tuple[slice, ...] = ()) -> np.ndarray:
             if name not in opened:
                 opened[name] = _array(group, name)
-            index: tuple[int | slice, ...] = (*place, *window)
+            index: Any = (*place, ..., *window)
             return np.asarray(opened[name][index])
 
         return read

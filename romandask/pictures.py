@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from romandask.model.sky import Region, covering_sums
+from romandask.model.spectra import ab_magnitude
 
 ROMAN_RGB = ("F184", "H158", "J129", "Y106")
 RUBIN_RGB = ("z", "i", "r", "g")
@@ -243,12 +244,6 @@ def blend_fraction(tables: dict[float, pd.DataFrame]) -> bytes:
     axes.set_ylim(0, 1)
     axes.legend()
     return _png(figure)
-
-
-def ab_magnitude(flux) -> np.ndarray:
-    """Return AB magnitudes of flux densities in nJy; NaN where not positive."""
-    flux = np.asarray(flux, float)
-    return np.where(flux > 0, 31.4 - 2.5 * np.log10(np.where(flux > 0, flux, 1.0)), np.nan)
 
 
 def _in_sigma(plane: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from romandask import pictures
 from romandask.effects import differences
 from romandask.flow import Planned, run_figures, stored_versions
+from romandask.model.spectra import ab_magnitude
 from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.survey import Survey
@@ -162,8 +163,8 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     for name, instrument in survey.instruments.items():
         middle[name] = instrument.bands[len(instrument.bands) // 2]
         for band in instrument.bands:
-            true[band] = pictures.ab_magnitude(pd.concat([frame[f"flux_{band}"] for frame in truth]))
-            measured[band] = pictures.ab_magnitude(objects[name][f"{band}_kronFlux"])
+            true[band] = ab_magnitude(pd.concat([frame[f"flux_{band}"] for frame in truth]))
+            measured[band] = ab_magnitude(objects[name][f"{band}_kronFlux"])
     return (
         "<h2>Measurements</h2>"
         + _image(

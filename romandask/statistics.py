@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from romandask.matches import length_name
+from romandask.model.spectra import ab_magnitude
 from romandask.runtime.products import TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.units import Unit
@@ -88,8 +89,7 @@ class _Unrecognised:
         flux = pd.concat(
             [self.rubin.load(k)[["objectId", f"{self.band}_kronFlux"]] for k in range(len(self.rubin.units))]
         )
-        magnitude = 31.4 - 2.5 * np.log10(flux[f"{self.band}_kronFlux"].where(flux[f"{self.band}_kronFlux"] > 0))
-        magnitude = pd.Series(magnitude.to_numpy(), index=flux["objectId"].to_numpy())
+        magnitude = pd.Series(ab_magnitude(flux[f"{self.band}_kronFlux"]), index=flux["objectId"].to_numpy())
         parts = []
         for length in self.lengths:
             counts = group_counts(self.groups, length)

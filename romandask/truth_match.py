@@ -14,6 +14,7 @@ from romandask.instruments.exposure import Instrument
 from romandask.kernels.counterparts import counterparts
 from romandask.model.config import DetectionSettings
 from romandask.model.sky import unit_vectors
+from romandask.model.spectra import ab_magnitude
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.units import Unit
@@ -24,15 +25,9 @@ BINS = np.arange(17.0, 30.01, 0.5)
 
 def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
     """Return the lazy counterparts of the objects of each tile (schema: catalogs/truth_match.yaml), a unit a tile."""
-    maker, tiles, render = _makers(detections)
-    units = tuple(
-        Unit(
-            tile.name,
-            {"tile": tile.name, "radius": settings.match_radius, "band": reference_band(render.instrument)},
-            ((detections.stage, tile.name), *render.truth.inputs(*_cone(tiles, k))),
-        )
-        for k, tile in enumerate(tiles.tiles)
-    )
+    _, _, render = _makers(detections)
+    state = {"radius": settings.match_radius, "band": reference_band(render.instrument)}
+    units = _units(detections, detections.stage, state)
     return TableProduct(
         f"truth_match/{render.instrument.name}", units, MatchTile(detections, settings), schema("truth_match"),
         bytes_per_unit=600 << 20, seconds_per_unit=5.0,
@@ -41,16 +36,9 @@ def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableP
 
 def truth_summary(matched: TableProduct, detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
     """Return the lazy list of the true objects of each tile, found or not (schema: catalogs/truth_summary.yaml)."""
-    _, tiles, render = _makers(detections)
+    _, _, render = _makers(detections)
     bands = render.instrument.bands
-    units = tuple(
-        Unit(
-            tile.name,
-            {"tile": tile.name, "faintest": settings.summary_magnitude, "bands": bands},
-            ((matched.stage, tile.name), *render.truth.inputs(*_cone(tiles, k))),
-        )
-        for k, tile in enumerate(tiles.tiles)
-    )
+    units = _units(detections, matched.stage, {"faintest": settings.summary_magnitude, "bands": bands})
     return TableProduct(
         f"truth_summary/{render.instrument.name}", units, SummariseTile(matched, detections, settings),
         schema("truth_summary", bands), bytes_per_unit=600 << 20, seconds_per_unit=5.0,
@@ -68,7 +56,7 @@ def completeness(summary: pd.DataFrame, matched: pd.DataFrame, band: str) -> pd.
 
     Completeness is counted in true magnitudes, purity in measured ones.
     """
-    true = np.asarray(_magnitude(summary[f"flux_{band}"]))
+    true = ab_magnitude(summary[f"flux_{band}"])
     found = summary["objectId"].to_numpy() > 0
     measured, real = matched["magnitude"].to_numpy(float), matched["truth_id"].to_numpy() >= 0
     counts = [np.histogram(values, BINS)[0] for values in (true, true[found], measured, measured[real])]
@@ -93,10 +81,10 @@ class MatchTile:
         band = reference_band(render.instrument)
         objects = self.detections.load(index, ("objects",))["objects"]
         true = render.truth.brief(*_cone(tiles, index)[:3], (band,))
-        magnitude = _magnitude(objects[f"{band}_kronFlux"])
+        magnitude = ab_magnitude(objects[f"{band}_kronFlux"])
         found = counterparts(
             unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy()), magnitude,
-            unit_vectors(true["ra"].to_numpy(), true["dec"].to_numpy()), _magnitude(true[f"flux_{band}"]),
+            unit_vectors(true["ra"].to_numpy(), true["dec"].to_numpy()), ab_magnitude(true[f"flux_{band}"]),
             np.radians(self.settings.match_radius / 3600),
         )  # fmt: skip
         none = found.row < 0
@@ -107,7 +95,7 @@ class MatchTile:
             "star": np.where(none, False, rows["star"].fillna(False).to_numpy(bool)),
             "separation": np.degrees(found.separation) * 3600, "candidates": found.candidates.astype(np.int32),
             "magnitude": magnitude,
-            "true_magnitude": np.where(none, np.nan, _magnitude(rows[f"flux_{band}"])),
+            "true_magnitude": np.where(none, np.nan, ab_magnitude(rows[f"flux_{band}"])),
         })  # fmt: skip
 
 
@@ -126,7 +114,7 @@ class SummariseTile:
         true = render.truth.brief(*_cone(tiles, index)[:3], bands)
         tile, grid = tiles.tiles[index], tiles.settings.grid()
         here = owned(true["ra"].to_numpy(), true["dec"].to_numpy(), tile, grid, maker.region)
-        true = true[here & (_magnitude(true[f"flux_{band}"]) < self.settings.summary_magnitude)]
+        true = true[here & (ab_magnitude(true[f"flux_{band}"]) < self.settings.summary_magnitude)]
         matched = self.matched.load(index)
         matched = matched[matched["truth_id"] >= 0].sort_values(["separation", "objectId"])
         key = ["truth_id", "star"]
@@ -139,6 +127,15 @@ class SummariseTile:
         joined["objectId"] = joined["objectId"].fillna(0).astype(np.int64)
         joined["objects"] = joined["objects"].fillna(0).astype(np.int32)
         return joined[schema("truth_summary", bands).names]
+
+
+def _units(detections: ImageProduct, source: str, state: dict) -> tuple[Unit, ...]:
+    """Return a unit a tile that reads the tile's unit of a stage and the truth on it."""
+    _, tiles, render = _makers(detections)
+    return tuple(
+        Unit(tile.name, {"tile": tile.name, **state}, ((source, tile.name), *render.truth.inputs(*_cone(tiles, k))))
+        for k, tile in enumerate(tiles.tiles)
+    )
 
 
 def _makers(detections: ImageProduct) -> tuple[DetectTile, DrawTile | DrizzleTile, RenderExposure]:
@@ -156,9 +153,3 @@ def _cone(tiles: DrawTile | DrizzleTile, index: int) -> tuple[float, float, floa
     tile, grid = tiles.tiles[index], tiles.settings.grid()
     radius = (grid.inner / np.sqrt(2) + 5) / 3600
     return tile.ra, tile.dec, radius, radius
-
-
-def _magnitude(flux: pd.Series) -> np.ndarray:
-    """Return AB magnitudes of fluxes in nJy; NaN where there is no light."""
-    values = flux.to_numpy(float)
-    return np.where(values > 0, 31.4 - 2.5 * np.log10(np.where(values > 0, values, 1)), np.nan)

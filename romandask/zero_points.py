@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from romandask.model.spectra import ab_magnitude
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.units import Unit
@@ -40,17 +41,16 @@ def offsets(stars: pd.DataFrame, bands: tuple[str, ...]) -> pd.DataFrame:
     """
     rows = []
     for band in bands:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            true = 31.4 - 2.5 * np.log10(stars[f"flux_{band}"].to_numpy(float))
-            bright = (true >= BRIGHT) & (true < FAINT)
-            for flux in FLUXES:
-                difference = (31.4 - 2.5 * np.log10(stars[f"{band}_{flux}"].to_numpy(float)) - true)[bright]
-                difference = difference[np.isfinite(difference)]
-                n = len(difference)
-                middle = float(np.median(difference)) if n else 0.0
-                spread = 1.4826 * np.median(np.abs(difference - middle)) if n > 1 else np.nan
-                # a median's error is a quarter larger than a mean's
-                rows.append((band, flux, n, middle, float(1.2533 * spread / np.sqrt(max(n, 1)))))
+        true = ab_magnitude(stars[f"flux_{band}"])
+        bright = (true >= BRIGHT) & (true < FAINT)
+        for flux in FLUXES:
+            difference = (ab_magnitude(stars[f"{band}_{flux}"]) - true)[bright]
+            difference = difference[np.isfinite(difference)]
+            n = len(difference)
+            middle = float(np.median(difference)) if n else 0.0
+            spread = 1.4826 * np.median(np.abs(difference - middle)) if n > 1 else np.nan
+            # a median's error is a quarter larger than a mean's
+            rows.append((band, flux, n, middle, float(1.2533 * spread / np.sqrt(max(n, 1)))))
     return pd.DataFrame(rows, columns=["band", "flux", "stars", "offset", "error"]).astype({"stars": np.int32})
 
 
@@ -75,7 +75,9 @@ class MakeZeroPoints:
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the offset of each band and flux."""
-        parts = []
+        true = [f"flux_{band}" for band in self.bands]
+        measured = [f"{band}_{flux}" for band in self.bands for flux in FLUXES]
+        parts = [pd.DataFrame(columns=[*true, *measured], dtype=float)]
         stored = self.detections.store is not None
         for k in range(len(self.detections.units)):
             if stored and not (self.detections.has(k) and self.summary.has(k) and self.matched.has(k)):
@@ -86,8 +88,5 @@ class MakeZeroPoints:
             alone = matched.loc[matched["candidates"] == 1, "objectId"]
             objects = self.detections.load(k, ("objects",))["objects"]
             objects = objects[(objects["flags"] == 0) & objects["objectId"].isin(alone)]
-            columns = ["objectId", *(f"{band}_{flux}" for band in self.bands for flux in FLUXES)]
-            true = summary[["objectId", *(f"flux_{band}" for band in self.bands)]]
-            parts.append(true.merge(objects[columns], on="objectId"))
-        names = [f"flux_{band}" for band in self.bands] + [f"{band}_{flux}" for band in self.bands for flux in FLUXES]
-        return offsets(pd.concat([pd.DataFrame(columns=names, dtype=float), *parts], ignore_index=True), self.bands)
+            parts.append(summary[["objectId", *true]].merge(objects[["objectId", *measured]], on="objectId"))
+        return offsets(pd.concat(parts, ignore_index=True), self.bands)

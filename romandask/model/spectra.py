@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 PLANCK_C = 1.98644586e-16
 """h c in erg cm; with wavelengths in nm the energy of a photon is PLANCK_C / (1e-7 wave) erg."""
@@ -70,6 +71,12 @@ def ab_photon_density(wave: np.ndarray) -> np.ndarray:
     """Return the photons /s/cm2/nm of AB magnitude 0: f_nu / (h lambda)."""
     planck = 6.62607015e-27  # erg s
     return 3.631e-20 / planck / wave
+
+
+def ab_magnitude(flux: ArrayLike) -> np.ndarray:
+    """Return AB magnitudes of flux densities in nJy; NaN where not positive."""
+    flux = np.asarray(flux, float)
+    return np.where(flux > 0, 31.4 - 2.5 * np.log10(np.where(flux > 0, flux, 1.0)), np.nan)
 
 
 @dataclass(frozen=True)

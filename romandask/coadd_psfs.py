@@ -55,7 +55,9 @@ def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:
     return np.stack([there[:, 0] - there[:, 1], there[:, 2] - there[:, 3]], axis=1)
 
 
-def input_psf(instrument: Instrument, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float):
+def input_psf(
+    instrument: Instrument, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float
+) -> np.ndarray:
     """Return a unit star of flat f_nu (side, side) of an exposure as it enters the tile around a position.
 
     It is the PSF in the middle of the detector (Troxel et al. 2023, section 5.2), turned as the exposure is there.

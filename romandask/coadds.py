@@ -145,14 +145,13 @@ class DrizzleTile:
         members, shape = self.members[k, band], (self.pixels, self.pixels)
         exposures = [exposure_of(source.table.iloc[i]) for i in members]
         headers = [instrument.header(exposure) for exposure in exposures]
-        parts = [strips(WCS(header), instrument.shape, target, shape) for header in headers]
+        frames = [WCS(header) for header in headers]
+        parts = [strips(frame, instrument.shape, target, shape) for frame in frames]
         # before the sums take their memory: sampling a PSF takes half a gigabyte for a moment
         psfs = np.zeros((most_inputs(self.members), *[psf_side(instrument)] * 2), np.float32)
-        for number, (exposure, header) in enumerate(zip(exposures, headers, strict=True)):
+        for number, (exposure, frame) in enumerate(zip(exposures, frames, strict=True)):
             if parts[number]:
-                psfs[number] = input_psf(
-                    instrument, exposure, WCS(header), tile.ra, tile.dec, self.settings.pixfrac
-                )  # fmt: skip
+                psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
         give_back()
         sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac)
         for i, exposure, header, part in zip(members, exposures, headers, parts, strict=True):
@@ -163,7 +162,7 @@ class DrizzleTile:
                     arrays, part, instrument, exposure, header, target, source.seed, self.settings.noise
                 )
             sums.add(planes)
-        seconds = source.table.iloc[members]["exptime"].to_numpy(float)
+        seconds = np.array([exposure.exptime for exposure in exposures])
         sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])
         count = sums.count
         image, *noise = sums.means()
@@ -319,17 +318,12 @@ def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return light
 
 
-def _star(
-    psf: PsfModel,
-    bandpass: Bandpass,
-    side: int,
-    offset: tuple[float, float] = (0.0, 0.0),
-) -> np.ndarray:
-    """Return a unit star (side, side) of flat f_nu whose centre is `offset` pixels from the middle."""
-    middle = (side - 1) / 2
+def _star(psf: PsfModel, bandpass: Bandpass, side: int) -> np.ndarray:
+    """Return a unit star (side, side) of flat f_nu in the middle."""
+    middle = np.array([(side - 1) / 2])
     scene = Scene(
-        x=np.array([middle + offset[0]]),
-        y=np.array([middle + offset[1]]),
+        x=middle,
+        y=middle,
         key=np.zeros(1, np.uint64),
         owner=np.zeros(1, int),
         kind=np.full(1, POINT),

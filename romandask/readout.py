@@ -32,11 +32,10 @@ from romandask.kernels.sca_exposure import (
 from romandask.kernels.synthetic_sca import SIDE, WAVES
 from romandask.model.seeds import rng
 from romandask.runtime.products import ImageProduct
+from romandask.runtime.store import ROWS_A_FILE
 
 DAY = 86400.0
 """Seconds."""
-_STORED = 512
-"""Rows of a stored chunk."""
 
 
 def before(table: pd.DataFrame, index: int) -> np.ndarray:
@@ -137,13 +136,13 @@ class ScaReadout:
                     last[name] = 0, read(name, ())
                 return last[name][1]
             everything = slice(None)
-            if rows == slice(None) or rows.start // _STORED != (rows.stop - 1) // _STORED:
+            if rows == slice(None) or rows.start // ROWS_A_FILE != (rows.stop - 1) // ROWS_A_FILE:
                 return read(name, (rows, everything))
-            part = rows.start // _STORED
+            part = rows.start // ROWS_A_FILE
             if name not in last or last[name][0] != part:
                 last.pop(name, None)
-                last[name] = part, read(name, (slice(part * _STORED, (part + 1) * _STORED), everything))
-            first = part * _STORED
+                last[name] = part, read(name, (slice(part * ROWS_A_FILE, (part + 1) * ROWS_A_FILE), everything))
+            first = part * ROWS_A_FILE
             return last[name][1][..., rows.start - first : rows.stop - first, :]
 
         return of_store

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from astropy.wcs import WCS
 
-from romandask.coadd_psfs import jacobian, star_on
+from romandask.coadd_psfs import jacobian, psf_side, star_on
 from romandask.coadds import DrizzleTile
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of
@@ -75,14 +75,15 @@ def coadd_psf(
         raise UserError(f"({ra}, {dec}): outside the tiles of this survey")
     tile, index = maker.tiles[tiles[0]], tiles[0] * len(instrument.bands) + instrument.bands.index(band)
     header = tile.header(maker.pixels, instrument.coadd_scale)
-    seen = _seen(coadds, maker, index, (tiles[0], band), instrument, ra, dec, WCS(header))
+    target = WCS(header)
+    seen = _seen(coadds, index, maker.members[tiles[0], band], instrument, ra, dec, target)
     if not seen:
         raise UserError(f"({ra}, {dec}): no exposure of {band} there")
-    stamp = coadds.variables[-1].shape[-1] if stamp is None else stamp
+    stamp = psf_side(instrument) if stamp is None else stamp
     shares = None if spectrum is None else _shares(spectrum, instrument.bandpass(band))
     attributes = {"tile": tile.name, "exposures": [one.name for one in seen]}
     if scale is None:
-        x, y = (float(value) for value in WCS(header).all_world2pix(ra, dec, 0))
+        x, y = (float(value) for value in target.all_world2pix(ra, dec, 0))
         low_x, low_y = round(x) - stamp // 2, round(y) - stamp // 2
         here = WCS({**header, "CRPIX1": header["CRPIX1"] - low_x, "CRPIX2": header["CRPIX2"] - low_y})
         inputs = [(one.exposure, one.wcs, one.exposure.exptime) for one in seen]
@@ -91,7 +92,7 @@ def coadd_psf(
         return xr.DataArray(image, dims=("v", "u"), attrs=attributes)
     total, weight = np.zeros((stamp, stamp)), 0.0
     for one in seen:
-        change = jacobian(one.wcs, WCS(header), one.x, one.y)
+        change = jacobian(one.wcs, target, one.x, one.y)
         fine = psf_image(instrument, one.exposure, one.x, one.y, shares)
         step = scale / instrument.coadd_scale
         total += one.exposure.exptime * drizzled_psf(
@@ -104,27 +105,26 @@ def coadd_psf(
 
 
 def _seen(
-    coadds: ImageProduct, maker: DrizzleTile, index: int, key: tuple[int, str], instrument: Instrument,
-    ra: float, dec: float, target: WCS,
-) -> list[Seen]:  # fmt: skip
-    """Return the exposures that a place of a tile is made of."""
-    names = np.array(maker.exposures.names, object)
-    members = maker.members[key]
+    coadds: ImageProduct, index: int, members: np.ndarray, instrument: Instrument, ra: float, dec: float, target: WCS
+) -> list[Seen]:
+    """Return the exposures, of those that touch a tile, of which a place of it is made."""
+    maker = coadds.make
+    assert isinstance(maker, DrizzleTile)
+    assert isinstance(maker.exposures.make, RenderExposure)
+    table = maker.exposures.make.table
     if coadds.has(index):
         column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
         found = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))
-        table = found["sets"]
-        members = members[table["input"][table["set"] == int(found["set"].item())].to_numpy()]
-    source = maker.exposures.make
-    assert isinstance(source, RenderExposure)
+        sets = found["sets"]
+        members = members[sets["input"][sets["set"] == int(found["set"].item())].to_numpy()]
     seen = []
     ny, nx = instrument.shape
     for i in members:
-        exposure = exposure_of(source.table.iloc[i])
+        exposure = exposure_of(table.iloc[i])
         wcs = WCS(instrument.header(exposure))
         x, y = (float(value) for value in wcs.all_world2pix(ra, dec, 0, quiet=True))
         if -0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5:
-            seen.append(Seen(str(names[i]), exposure, wcs, x, y))
+            seen.append(Seen(maker.exposures.names[i], exposure, wcs, x, y))
     return seen
 
 
@@ -132,4 +132,4 @@ def _shares(spectrum: Spectrum, bandpass: Bandpass) -> np.ndarray:
     photons = (np.array([float(spectrum(wave)) for wave in bandpass.wave]) * bandpass.weights) @ bandpass.node_weights()
     if not (np.isfinite(photons).all() and photons.min() >= 0 and photons.sum() > 0):
         raise UserError("spectrum: it must give photons in the band, none negative")
-    return photons / photons.sum()
+    return photons

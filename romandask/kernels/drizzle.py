@@ -89,14 +89,15 @@ def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets
     ny, nx = weight.shape
     height, width = total.shape
     step = knots[1] - knots[0]
-    cells = np.zeros((_window(lower, upper, step), _window(lower, upper, step) + 2))
+    most = _window(lower, upper, step)
+    cells = np.zeros((most, most + 2))
     # column after column of pieces of rows: what one falls on the next falls on too, and it is still in cache
     for piece in range(len(knots) - 1):
         begin = max(int(np.ceil(knots[piece])) - first, 0)
         end = nx if piece == len(knots) - 2 else min(int(np.ceil(knots[piece + 1])) - first, nx)
         for row in range(ny):
             low, high = lower[row, :, piece], upper[row, :, piece]
-            if _beyond(low, high, step, len(cells), height, width):
+            if _beyond(low, high, step, most, height, width):
                 continue
             for column in range(begin, end):
                 w = weight[row, column]

@@ -96,33 +96,32 @@ def noise_ratios(noise: np.ndarray, error: np.ndarray, mask: np.ndarray) -> np.n
 
 def median(planes: list[np.ndarray], weights: list[np.ndarray]) -> np.ndarray:
     """Return the median over bands (ny, nx): a band counts where it has weight, and 0 stands for no data."""
-    return _median(np.stack(planes), np.stack(weights))
+    return _median(tuple(planes), tuple(weights))
 
 
 @numba.njit(nogil=True, cache=True)
 def _median(planes, weights):
-    bands, ny, nx = planes.shape
+    bands, (ny, nx) = len(planes), planes[0].shape
     out = np.empty((ny, nx), np.float32)
     values = np.empty(bands, np.float32)
     for y in range(ny):
         if bands == 4:
             # the two middle ones of four, by a selection network; where a band is missing it is done again below
             for x in range(nx):
-                a, b, c, d = planes[0, y, x], planes[1, y, x], planes[2, y, x], planes[3, y, x]
+                a, b, c, d = planes[0][y, x], planes[1][y, x], planes[2][y, x], planes[3][y, x]
                 low = max(min(a, b), min(c, d))
                 high = min(max(a, b), max(c, d))
                 out[y, x] = (low + high) * np.float32(0.5)
         for x in range(nx):
-            count = 0
-            for band in range(bands):
-                if weights[band, y, x] > 0:
-                    count += 1
-            if count == 4 and bands == 4:
+            whole = bands == 4
+            for weight in weights:
+                whole &= weight[y, x] > 0
+            if whole:
                 continue
             count = 0
             for band in range(bands):
-                if weights[band, y, x] > 0:
-                    value, place = planes[band, y, x], count
+                if weights[band][y, x] > 0:
+                    value, place = planes[band][y, x], count
                     while place > 0 and values[place - 1] > value:
                         values[place] = values[place - 1]
                         place -= 1

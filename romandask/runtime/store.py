@@ -22,6 +22,8 @@ from romandask.model.errors import UserError
 CELL = "_healpix_29"
 """Column of HEALPix cells of order 29, by which the rows of catalogs are sorted."""
 ROWS_A_GROUP = 50_000
+ROWS_A_FILE = 512
+"""About, of variables that are not compressed."""
 _SHARD = 4
 """Inner chunks along each side of a shard."""
 MARGIN = "_margin"
@@ -213,7 +215,7 @@ def _chunks(variable: Variable) -> tuple[tuple[int, ...], tuple[int, ...] | None
     """Return the shapes of the chunks of a unit and of its shards; None where there are none."""
     many, image = variable.shape[:-2], variable.shape[-2:]
     if not variable.compress:
-        return (*many, *(_inner_chunk(length, 512) for length in image[:-1]), image[-1]), None
+        return (*many, *(_inner_chunk(length, ROWS_A_FILE) for length in image[:-1]), image[-1]), None
     inner = tuple(_inner_chunk(length) for length in image)
     shard = (min(_SHARD, -(-length // chunk)) * chunk for length, chunk in zip(image, inner, strict=True))
     return (*(1 for _ in many), *inner), (*many, *shard)

@@ -147,7 +147,7 @@ class DrizzleTile:
         headers = [instrument.header(exposure) for exposure in exposures]
         frames = [WCS(header) for header in headers]
         parts = [strips(frame, instrument.shape, target, shape) for frame in frames]
-        # before the sums take their memory: sampling a PSF takes half a gigabyte for a moment
+        # before the sums take their memory: sampling PSFs takes some of its own
         psfs = np.zeros((most_inputs(self.members), *[psf_side(instrument)] * 2), np.float32)
         for number, (exposure, frame) in enumerate(zip(exposures, frames, strict=True)):
             if parts[number]:

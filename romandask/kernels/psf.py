@@ -212,8 +212,8 @@ def fine_image(psf: PsfModel, shares: np.ndarray, x: float, y: float, side: int,
 def _finer(transform: np.ndarray, grid: Grid, oversampling: int) -> np.ndarray:
     """Return the image (grid.size * oversampling, square) of a transform, centred on the sample in the middle."""
     rows, columns = grid.shape
-    # frequencies beyond the optics' reach are empty: padded with zeros they make finer samples
-    fine = np.lcm(rows, grid.size * oversampling)
+    # frequencies beyond the optics' reach are empty: padded with zeros, or more of them, they make finer samples
+    fine = grid.size * oversampling * -(-rows // (grid.size * oversampling))
     padded = np.zeros((fine, fine // 2 + 1), np.complex64)
     padded[fine // 2 - rows // 2 : fine // 2 + rows // 2, :columns] = transform
     image = fft.fftshift(fft.irfft2(np.fft.ifftshift(padded, axes=0), s=(fine, fine))) * (fine / grid.size) ** 2

@@ -201,10 +201,10 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         "distributed.admin.large-graph-warning-threshold": "100MB",
         # the threads that decode chunks would each keep a heap of their own, and a worker twice what it uses
         "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2,
-        # whole images go back to the system at once, not to a heap that grows from unit to unit; smaller ones are kept
-        # for what comes next: fresh pages cost more time than much of what is done with them
-        "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20,
-        "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 64 << 20,
+        # large arrays go back to the system at once, not to a heap that grows from unit to unit (with 32 MB it passed a
+        # worker's limit); smaller ones are kept for what comes next, for fresh pages cost time
+        "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 8 << 20,
+        "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 16 << 20,
     }
     with (
         dask.config.set(quiet),

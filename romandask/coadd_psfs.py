@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -18,13 +17,6 @@ from romandask.psfs import OVERSAMPLING, psf_image
 
 RADIUS = 3.0
 """Half the side of the PSF images, arcsec, for a pixel of 0.0575 arcsec; larger pixels get larger images."""
-
-
-def give_back() -> None:
-    """Give free memory to the system, where the C library can: what sampling PSFs took is a tenth of a worker's."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def psf_side(instrument: Instrument) -> int:

@@ -14,7 +14,7 @@ import pandas as pd
 import sep
 from astropy.wcs import WCS
 
-from romandask.coadd_psfs import give_back, input_psf, psf_side
+from romandask.coadd_psfs import input_psf, psf_side
 from romandask.exposures import RenderExposure, cone, empty_variance, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.detector import noise_realisation, usable
@@ -33,6 +33,7 @@ from romandask.model.tiles import Tile
 from romandask.pointings import corners_of
 from romandask.psfs import flat_shares
 from romandask.runtime.manifest import digest
+from romandask.runtime.memory import give_back
 from romandask.runtime.products import Coordinates, ImageProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable

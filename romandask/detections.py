@@ -10,7 +10,6 @@ from astropy.wcs import WCS
 
 from romandask.coadds import DrawTile, DrizzleTile
 from romandask.exposures import RenderExposure
-from romandask.instruments.exposure import Instrument
 from romandask.kernels.extract import (
     Found,
     aperture_fluxes,
@@ -20,10 +19,12 @@ from romandask.kernels.extract import (
     psf_half_light_radius,
     select,
 )
+from romandask.kernels.photometry import extinction
 from romandask.model.config import DetectionSettings
-from romandask.model.sky import Region, cells_in_cone
+from romandask.model.sky import Region, cells_in_cone, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
 from romandask.runtime.hats import with_spatial_index
+from romandask.runtime.memory import give_back
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
@@ -44,17 +45,20 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     maker = coadds.make
     if not isinstance(maker, DrizzleTile | DrawTile):
         raise TypeError("detections need the product that coadds() returns")
-    instrument, pixels = _instrument(maker), maker.pixels
-    bands = instrument.bands
+    render, pixels = _render(maker), maker.pixels
+    instrument, bands = render.instrument, render.instrument.bands
     state = {
         "settings": settings.model_dump(exclude={"order", "match_radius", "summary_magnitude"}),
         "bands": bands, "region": vars(region),
         "kind": instrument.detection, "extended": EXTENDED, "aperture": instrument.aperture,
     }  # fmt: skip
-    units = tuple(
-        Unit(tile.name, {**state, "tile": tile.name}, tuple((coadds.stage, f"{tile.name}-{band}") for band in bands))
-        for tile in maker.tiles
-    )
+
+    def inputs(k: int, tile: Tile) -> tuple[tuple[str, str], ...]:
+        images = tuple((coadds.stage, f"{tile.name}-{band}") for band in bands)
+        # the Milky Way's dust is that of the truth
+        return images + render.truth.inputs(*tile_cone(maker, k))
+
+    units = tuple(Unit(tile.name, {**state, "tile": tile.name}, inputs(k, tile)) for k, tile in enumerate(maker.tiles))
     text = {"long_name": "number of the object, the last 24 bits of its objectId; 0 for none"}
     return ImageProduct(
         f"detections/{instrument.name}",
@@ -65,8 +69,8 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         (len(units),),
         lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        # three planes and some rows of all bands; then the map of objects, and of one band image, error, mask and noise
-        bytes_per_unit=max(pixels**2 * 12 + pixels * min(pixels, 1024) * 12 * len(bands), pixels**2 * 17) + (200 << 20),
+        # three planes, a mask and some chunks of all bands; after that a band's two planes and the map of objects
+        bytes_per_unit=pixels**2 * 13 + (330 << 20),
         seconds_per_unit=pixels**2 * 1.2e-6,
         tables={"objects": schema("objects", bands)},
     )
@@ -102,7 +106,7 @@ def objects(
         )
         for cell, members in tiles_of.items()
     )
-    name = _instrument(maker).name
+    name = _render(maker).instrument.name
     return TableProduct(
         f"objects/{name}",
         units,
@@ -126,7 +130,7 @@ class DetectTile:
         """Return the map of a tile and the objects that it owns (schema: catalogs/objects.yaml)."""
         maker = self.coadds.make
         assert isinstance(maker, DrizzleTile | DrawTile)
-        instrument, tile, settings = _instrument(maker), maker.tiles[index], self.settings
+        instrument, tile, settings = _render(maker).instrument, maker.tiles[index], self.settings
         bands = TileBands(self.coadds, instrument, index)
         combined = bands.detection()
         found, segments = detect(
@@ -135,11 +139,23 @@ class DetectTile:
         radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
         # a band at a time is in memory
         del combined
+        give_back()
         wcs = WCS(tile.header(maker.pixels, instrument.coadd_scale))
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region) & (found.snr >= settings.min_snr)
         objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, segments, radius)
+        at = unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy())
+        dust = _render(maker).truth.milky_way(at, *tile_cone(maker, index)[:3])
+        for band in instrument.bands:
+            objects[f"{band}_extinction"] = extinction(instrument.bandpass(band), dust)
         return {"segmentation": segments, "objects": objects}
+
+
+def tile_cone(tiles: DrawTile | DrizzleTile, index: int) -> tuple[float, float, float, float]:
+    """Return centre and radii (degrees) of the cone around the unique area of a tile, for galaxies and stars."""
+    tile, grid = tiles.tiles[index], tiles.settings.grid()
+    radius = (grid.inner / np.sqrt(2) + 5) / 3600
+    return tile.ra, tile.dec, radius, radius
 
 
 def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: Region) -> np.ndarray:
@@ -212,7 +228,7 @@ class CollectPartition:
         return found if self.zero is None else corrected(found, self.zero.load(0))
 
 
-def _instrument(maker: DrizzleTile | DrawTile) -> Instrument:
+def _render(maker: DrizzleTile | DrawTile) -> RenderExposure:
     render = maker.exposures.make
     assert isinstance(render, RenderExposure)
-    return render.instrument
+    return render

@@ -153,8 +153,10 @@ def exposure_maps(region: Region, footprints: dict[str, np.ndarray]) -> bytes:
     return _png(figure)
 
 
-def magnitude_histograms(true: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> bytes:
-    """Return histograms of true and measured magnitudes, a panel a band."""
+def magnitude_histograms(
+    true: dict[str, np.ndarray], measured: dict[str, np.ndarray], depth: dict[str, float]
+) -> bytes:
+    """Return histograms of true and measured magnitudes with lines at the depths, a panel a band."""
     bands = list(true)
     figure = _figure(14, 2.9 * -(-len(bands) // 5))
     edges = np.arange(16, 31.01, 0.5)
@@ -163,11 +165,57 @@ def magnitude_histograms(true: dict[str, np.ndarray], measured: dict[str, np.nda
         axes.hist(true[band][np.isfinite(true[band])], edges, histtype="step", color="0.35", label="true, all")
         found = measured[band]
         axes.hist(found[np.isfinite(found)], edges, color="tab:blue", alpha=0.5, label="measured")
+        if np.isfinite(depth[band]):
+            axes.axvline(depth[band], color="tab:red", lw=1, ls="--", label=f"depth {depth[band]:.2f}")
         axes.set_yscale("symlog", linthresh=1)
         axes.set_title(band, fontsize=10)
         axes.set_xlabel("AB mag")
+        axes.legend(fontsize=7)
+    return _png(figure)
+
+
+def colour_histograms(colours: dict[str, tuple[np.ndarray, np.ndarray]]) -> bytes:
+    """Return histograms of true and measured colours, a panel a pair of bands."""
+    columns = max(1, min(4, len(colours)))
+    rows = max(1, -(-len(colours) // columns))
+    figure = _figure(3.6 * columns, 2.7 * rows)
+    edges = np.arange(-1.5, 3.01, 0.1)
+    for position, (name, (true, measured)) in enumerate(colours.items()):
+        axes = figure.add_subplot(rows, columns, position + 1)
+        axes.hist(true, edges, histtype="step", color="0.35", label="true")
+        axes.hist(measured, edges, color="tab:blue", alpha=0.5, label="measured")
+        axes.set_title(f"{name}: {len(true)}", fontsize=10)
+        axes.set_xlabel("AB mag")
         if position == 0:
             axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def residuals(tables: dict[str, pd.DataFrame]) -> bytes:
+    """Return bias and scatter of magnitudes, pulls of fluxes and the flagged share by magnitude, a column a survey.
+
+    `tables` are those of `romandask.validation.residuals`; bins of fewer than five objects are not shown.
+    """
+    figure = _figure(6.5 * len(tables), 8.4)
+    panels = (
+        ("bias", "scatter", "measured less true, mag", (-0.6, 0.6)),
+        ("pull", "pull_scatter", "pull", (-4, 4)),
+        ("flagged", None, "flagged share", (0, 1)),
+    )
+    for column, (survey, table) in enumerate(tables.items()):
+        shown = table[table["objects"] >= 5]
+        for row, (name, spread, label, limits) in enumerate(panels):
+            axes = figure.add_subplot(3, len(tables), row * len(tables) + column + 1)
+            axes.axhline(0, color="0.8", lw=0.8)
+            for number, (band, part) in enumerate(shown.groupby("band", sort=False)):
+                place = part["magnitude"] + 0.03 * (number - 2)
+                error = part[spread] if spread else None
+                axes.errorbar(place, part[name], error, fmt="o-", ms=3, lw=0.9, elinewidth=0.7, label=band)
+            axes.set_ylim(*limits)
+            axes.set_ylabel(label)
+            axes.set_xlabel(f"{survey}, true AB mag")
+            if row == 0 and len(shown):
+                axes.legend(fontsize=8, ncols=3)
     return _png(figure)
 
 

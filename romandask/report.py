@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+from itertools import pairwise
 from pathlib import Path
 
 import pandas as pd
@@ -17,6 +18,22 @@ from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.survey import Survey
 from romandask.truth_match import reference_band
+from romandask.validation import colours_of, depths, residuals
+
+PAPER_DEPTHS = {"Y106": 26.9, "J129": 26.9, "H158": 26.9, "F184": 26.2}
+"""5-sigma depths of point sources, AB mag (Troxel et al. 2023)."""
+PAPER_AREA = 1039 * 0.125**2
+"""Square degrees of its tiles' unique areas."""
+PAPER_COUNTS = {
+    key: count / PAPER_AREA
+    for key, count in {
+        ("roman", "galaxies"): 12_432_713,
+        ("roman", "stars"): 215_613,
+        ("rubin", "galaxies"): 6_831_656,
+        ("rubin", "stars"): 159_575,
+    }.items()
+}
+"""Detected objects per square degree."""
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2em auto; padding: 0 1em; color: #1c2430; }
@@ -159,21 +176,38 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     catalogs = survey.truth_catalogs
     truth = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
     truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
-    true, measured, middle = {}, {}, {}
-    for name, instrument in survey.instruments.items():
-        middle[name] = instrument.bands[len(instrument.bands) // 2]
-        for band in instrument.bands:
-            true[band] = ab_magnitude(pd.concat([frame[f"flux_{band}"] for frame in truth]))
-            measured[band] = ab_magnitude(objects[name][f"{band}_kronFlux"])
+    true, measured, middle, colours = {}, {}, {}, {}
+    depth = {band: value for name in objects for band, value in depths(objects[name], survey.bands(name)).items()}
+    joined = {name: survey.objects_with_truth(name) for name in objects}
+    for name, frame in objects.items():
+        bands = survey.bands(name)
+        middle[name] = bands[len(bands) // 2]
+        for band in bands:
+            true[band] = ab_magnitude(pd.concat([part[f"flux_{band}"] for part in truth]))
+            measured[band] = ab_magnitude(frame[f"{band}_kronFlux"])
+        for pair in pairwise(bands):
+            colours[" - ".join(pair)] = colours_of(joined[name], *pair)
+    found = {name: residuals(frame, survey.bands(name)) for name, frame in joined.items()}
     return (
         "<h2>Measurements</h2>"
+        + _beside_the_paper(survey, objects, joined, depth)
         + _image(
-            pictures.magnitude_histograms(true, measured),
-            "Magnitudes: all true objects of the region, and Kron magnitudes of the detected.",
+            pictures.magnitude_histograms(true, measured, depth),
+            "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
+            "5-sigma depths of point sources.",
+        )
+        + _image(
+            pictures.colour_histograms(colours),
+            "Colours of objects with a signal to noise above 10 in both bands: true (grey) and measured.",
         )
         + _image(
             pictures.size_magnitude(objects, middle),
             "Size and magnitude; point sources form the locus at the PSF's size.",
+        )
+        + _image(
+            pictures.residuals(found),
+            "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
+            "their errors (pulls), median and scatter; and the share of objects that are flagged.",
         )
         + _image(
             pictures.completeness(
@@ -187,7 +221,29 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     )
 
 
+def _beside_the_paper(
+    survey: Survey, objects: dict[str, pd.DataFrame], joined: dict[str, pd.DataFrame], depth: dict[str, float]
+) -> str:
+    """Return depths, densities and flags beside those of Troxel et al. (2023)."""
+    degrees = survey.region.area / 3600
+    rows = []
+    for name, frame in objects.items():
+        stars = joined[name]["star"].to_numpy(bool)
+        for kind, count in (("galaxies", int((~stars).sum())), ("stars", int(stars.sum()))):
+            paper = PAPER_COUNTS.get((name, kind))
+            rows.append(
+                (f"{name}: detected {kind} / deg2", f"{count / degrees:,.0f}", f"{paper:,.0f}" if paper else "")
+            )
+        rows.append((f"{name}: flagged objects", f"{(frame['flags'] != 0).mean():.1%}" if len(frame) else "", ""))
+        for band in survey.bands(name):
+            paper = PAPER_DEPTHS.get(band)
+            rows.append((f"{band}: 5-sigma depth, AB mag", f"{depth[band]:.2f}", f"{paper:.1f}" if paper else ""))
+    return _table(pd.DataFrame(rows, columns=["", "here", "Troxel et al. 2023"]))
+
+
 def _blends(survey: Survey) -> str:
+    if not {"roman", "rubin"} <= set(survey.instruments):
+        return ""
     lengths = survey.pipeline.matches.linking_lengths
     statistics = survey.statistics
     text = "<h2>Blends</h2><p>Friends of friends over the objects of both surveys. Rows: Roman, columns: Rubin.</p>"

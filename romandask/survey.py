@@ -2,59 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import dask.dataframe as dd
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from romandask.calibration import calibrations
-from romandask.coadds import coadds
 from romandask.cutouts import Positions, Wanted, cutouts, located
-from romandask.detections import detections, objects
-from romandask.exposures import exposures
-from romandask.incoming import incoming, open_sources
-from romandask.instruments.exposure import Instrument
-from romandask.matches import Matches, matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
-from romandask.model.spectra import Bandpass
-from romandask.model.tiles import Tile
-from romandask.pipeline import Pipeline, load_pipeline
-from romandask.pointings import pointings, visits
-from romandask.psfs import psfs
+from romandask.pipeline import load_pipeline
+from romandask.pointings import visits
 from romandask.runtime.manifest import read_record
-from romandask.runtime.products import ImageProduct, TableProduct, conform, to_frame
-from romandask.runtime.schemas import schema
-from romandask.runtime.store import Store, read_parquet
-from romandask.runtime.units import Unit
+from romandask.runtime.store import Store
 from romandask.star import Spectrum, coadd_psf
-from romandask.statistics import Statistics, matrix, statistics
-from romandask.truth import TruthCatalogs, truth
-from romandask.truth_index import truth_index
-from romandask.truth_match import completeness, reference_band, truth_match, truth_summary
-from romandask.zero_points import zero_points
+from romandask.statistics import Statistics, matrix
+from romandask.survey_products import SurveyProducts
+from romandask.truth_match import completeness, reference_band
+from romandask.validation import depths, residuals, with_truth
+from romandask.zero_points import FLUXES
 
 
-class Survey:
-    """The products of one survey.
+class Survey(SurveyProducts):
+    """The products of one survey, as its users ask for them.
 
     Parameters
     ----------
     pipeline : its settings
     store : where its units are kept; None to make everything on demand
     """
-
-    def __init__(self, pipeline: Pipeline, store: Store | None = None):
-        self.pipeline = pipeline
-        self.store = store
-        self._made: dict[tuple[str, str], Any] = {}
-
-    # ---- what users ask for
 
     def truth(self, kind: str, region: Region | Cone | None = None) -> dd.DataFrame:
         """Return the lazy truth catalog `galaxies` or `stars` (schema: catalogs/<kind>.yaml).
@@ -161,6 +140,25 @@ class Survey:
         tables = self.truth_summary_product(survey), self.truth_match_product(survey)
         return completeness(*(table.all_rows() for table in tables), reference_band(self._instrument(survey)))
 
+    def objects_with_truth(self, survey: str) -> pd.DataFrame:
+        """Return a survey's objects beside their true counterparts: flux_<band> (nJy), star, redshift, truth_id."""
+        tables = self.object_product, self.truth_match_product, self.truth_summary_product
+        return with_truth(*(table(survey).all_rows() for table in tables))
+
+    def depths(self, survey: str) -> pd.Series:
+        """Return the 5-sigma depths of point sources, AB mag by band."""
+        return depths(self.object_product(survey).all_rows(), self.bands(survey))
+
+    def residuals(self, survey: str, flux: str = "kronFlux") -> pd.DataFrame:
+        """Return by band and magnitude how measured fluxes differ from the truth: `romandask.validation.residuals`."""
+        return residuals(
+            self.objects_with_truth(survey), self.bands(survey), self._one({f: f for f in FLUXES}, flux, FLUXES)
+        )
+
+    def bands(self, survey: str) -> tuple[str, ...]:
+        """Return the bands of an instrument."""
+        return self._instrument(survey).bands
+
     def objects(self, survey: str) -> dd.DataFrame:
         """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
         return self.object_product(survey).frame
@@ -186,177 +184,6 @@ class Survey:
                 lines.append(f"  {stage:20s} {len(records):6d} units {size / 1e6:12.1f} MB")
         return "\n".join(lines)
 
-    # ---- the products behind them
-
-    @cached_property
-    def region(self) -> Region:
-        """The box on the sky."""
-        return self.pipeline.region.region()
-
-    @cached_property
-    def instruments(self) -> dict[str, Instrument]:
-        """Instruments by name."""
-        return self.pipeline.instruments()
-
-    @cached_property
-    def tiles(self) -> list[Tile]:
-        """The tiles whose unique areas touch the region."""
-        return self.pipeline.coadds.grid().covering(self.region)
-
-    @cached_property
-    def bandpasses(self) -> dict[str, Bandpass]:
-        """All bands of all instruments; the truth holds a flux for each."""
-        return {
-            band: instrument.bandpass(band) for instrument in self.instruments.values() for band in instrument.bands
-        }
-
-    @property
-    def data(self) -> Path:
-        """The folder that source files are below."""
-        return Path(self.pipeline.data)
-
-    @cached_property
-    def incoming_product(self) -> TableProduct:
-        """The rows of the source catalogs, where truth is not generated."""
-        return self._stored(incoming(open_sources(self.pipeline.truth, self.data)))
-
-    @cached_property
-    def truth_catalogs(self) -> TruthCatalogs:
-        """The truth catalogs."""
-        settings = self.pipeline
-        rows = None if settings.truth.source == "generate" else self.incoming_product
-        return truth(settings.truth, self.data, self.region, self.bandpasses, settings.seed, self.store, rows)
-
-    def pointing_product(self, survey: str) -> TableProduct:
-        """The pointings as a product of one unit."""
-        settings = self.pipeline
-        block = getattr(settings, survey)
-        state = {
-            "settings": block.model_dump(), "region": settings.region.model_dump(), "seed": settings.seed,
-            "coadds": settings.coadds.model_dump(exclude={"pixfrac"}),
-            "source": _state(self.data, block.pointings.path),
-        }  # fmt: skip
-        return self._stored(
-            TableProduct(
-                f"pointings/{survey}",
-                (Unit("all", state),),
-                _MakePointings(self, survey),
-                schema("pointings"),
-                bytes_per_unit=1 << 30,
-            )
-        )
-
-    def exposure_product(self, survey: str) -> ImageProduct:
-        """The exposures of an instrument."""
-        instrument, settings = self._instrument(survey), self.pipeline
-        return self._once(
-            "exposures",
-            survey,
-            lambda: exposures(
-                self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed,
-                self.calibration_product if survey == "roman" and settings.calibration() else None, self.store,
-            ),
-        )  # fmt: skip
-
-    @property
-    def calibration_product(self) -> ImageProduct:
-        """The calibrations of the SCAs that Roman's exposures use."""
-        source = self.pipeline.calibration()
-        if source is None:
-            raise UserError("this survey has no calibrations: they belong to roman.detector: sca")
-        scas = sorted(set(self.pointings("roman")["detector"].tolist()))
-        return self._once("calibration", "roman", lambda: calibrations(source, scas))
-
-    def truth_index_product(self, survey: str) -> TableProduct:
-        """The truth index of an instrument's exposures."""
-        return self._once("truth_index", survey, lambda: truth_index(self.exposure_product(survey)))
-
-    def psf_product(self, survey: str) -> ImageProduct:
-        """The PSF images of an instrument's exposures: made when asked for."""
-        return self._once("psfs", survey, lambda: psfs(self.exposure_product(survey)))
-
-    def coadd_product(self, survey: str) -> ImageProduct:
-        """The coadds of an instrument."""
-        self._instrument(survey)
-        return self._once(
-            "coadds", survey, lambda: coadds(self.exposure_product(survey), self.tiles, self.pipeline.coadds)
-        )
-
-    def detection_product(self, survey: str) -> ImageProduct:
-        """The detections of each tile."""
-        settings = self.pipeline.detections
-        return self._once("detections", survey, lambda: detections(self.coadd_product(survey), settings, self.region))
-
-    def truth_match_product(self, survey: str) -> TableProduct:
-        """The true counterparts of the objects of each tile."""
-        settings = self.pipeline.detections
-        return self._once("truth_match", survey, lambda: truth_match(self.detection_product(survey), settings))
-
-    def truth_summary_product(self, survey: str) -> TableProduct:
-        """The true objects of each tile."""
-        matched, settings = self.truth_match_product(survey), self.pipeline.detections
-        found = self.detection_product(survey)
-        return self._once("truth_summary", survey, lambda: truth_summary(matched, found, settings))
-
-    def zero_points_product(self, survey: str) -> TableProduct:
-        """The offsets of an instrument's magnitudes, from its stars."""
-        bands = self._instrument(survey).bands
-        tables = self.truth_summary_product(survey), self.truth_match_product(survey)
-        return self._once("zero_points", survey, lambda: zero_points(*tables, self.detection_product(survey), bands))
-
-    def object_product(self, survey: str) -> TableProduct:
-        """The object table."""
-        found, settings = self.detection_product(survey), self.pipeline.detections
-        zero, tiles = self.zero_points_product(survey), self.coadd_product(survey)
-        return self._once("objects", survey, lambda: objects(found, tiles, settings, self.region, zero))
-
-    @property
-    def match_products(self) -> Matches:
-        """The stages of friends of friends."""
-        tables = {name: self.object_product(name) for name in self.instruments}
-        return self._once("matches", "all", lambda: matches(tables, self.pipeline.matches, self.region, self.store))
-
-    @property
-    def statistic_products(self) -> Statistics:
-        """The tables of the statistics stage."""
-        made = statistics(
-            self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths
-        )
-        return Statistics(self._stored(made.blends), self._stored(made.unrecognised))
-
-    def make_pointings(self, survey: str) -> pd.DataFrame:
-        """Return the pointings made afresh, whatever the store has."""
-        settings = self.pipeline
-        block, grid = getattr(settings, survey), settings.coadds.grid()
-        instrument = self._instrument(survey)
-        frame = pointings(instrument, block.pointings, self.data, self.region, self.tiles, grid.side, settings.seed)
-        return to_frame(conform(frame, schema("pointings"), f"pointings/{survey}"))
-
-    def _read_pointings(self, survey: str) -> pd.DataFrame:
-        self._instrument(survey)
-        stage = f"pointings/{survey}"
-        if self.store is not None and read_record(self.store, stage, "all"):
-            return to_frame(read_parquet(self.store.table(stage, "all")))
-        return self.make_pointings(survey)
-
-    def _instrument(self, survey: str) -> Instrument:
-        return self._one(self.instruments, survey, tuple(self.instruments))
-
-    def _one(self, mapping, name: str, valid: tuple[str, ...]):
-        if name not in valid:
-            raise UserError(f"{name!r}: this survey has {', '.join(valid)}")
-        return mapping[name]
-
-    def _once(self, kind: str, survey: str, make: Callable[[], Any]) -> Any:
-        """Return a product, made at the first asking: with a store it reads what is there."""
-        if (kind, survey) not in self._made:
-            self._made[kind, survey] = self._stored(make())
-        return self._made[kind, survey]
-
-    def _stored(self, product):
-        stored = getattr(product, "stored", None)
-        return product if self.store is None or stored is None else stored(self.store)
-
 
 class SurveyStatistics:
     """Statistics of the groups, as tables."""
@@ -379,24 +206,6 @@ class SurveyStatistics:
         if not np.isclose(length, self._lengths).any():
             raise UserError(f"linking length {length}: this survey has {', '.join(map(str, self._lengths))} arcsec")
         return length
-
-
-class _MakePointings:
-    """Makes the pointings of one instrument; holds the pipeline alone, so that it travels light."""
-
-    def __init__(self, survey: Survey, name: str):
-        self._pipeline, self._name = survey.pipeline, name
-
-    def __call__(self, index: int) -> pd.DataFrame:
-        return Survey(self._pipeline).make_pointings(self._name)
-
-
-def _state(data: Path, path: str | None):
-    """Return what identifies the content of a source file without reading it."""
-    if path is None:
-        return None
-    file = data / path
-    return (path, file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else (path,)
 
 
 def open_survey(path: str | Path) -> Survey:

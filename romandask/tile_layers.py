@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from romandask.instruments.exposure import Instrument
-from romandask.kernels.extract import with_psf_ratio
+from romandask.kernels.extract import psf_scatter
 from romandask.kernels.layer import Layer, errors, median, noise_ratios, rms_of, weighted_mean
 from romandask.model.spectra import NJY_ZERO_POINT
+from romandask.runtime.memory import give_back
 from romandask.runtime.products import ImageProduct
+from romandask.runtime.store import chunk_side
 
+Window = tuple[slice, ...]
+"""Rows and columns of a plane."""
+WHOLE: Window = (slice(None), slice(None))
 VISIT = 30.0
 """Seconds of a visit, where a coadd's weight is not its exposure time."""
-_ROWS = 1024
-"""Rows of all bands that are in memory for the detection image."""
+_CHUNKS = 3
+"""Chunks in a row, of all bands, that are in memory for the detection image."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +31,20 @@ class TileBands:
     coadds: ImageProduct
     instrument: Instrument
     tile: int
-    made: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
-    """Bands that are not stored, kept while the tile is worked on."""
+    readers: dict[int, Callable[[str, tuple[slice, ...]], np.ndarray]] = field(default_factory=dict)
+    """What reads a band: from the store, or, while the tile is worked on, from memory where it is not stored."""
 
-    def arrays(self, band: str, names: tuple[str, ...], rows: slice = slice(None)) -> dict[str, np.ndarray]:
-        """Return some rows of arrays of a band; of noise the first realisation."""
+    def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
+        """Return a window (rows, columns) of arrays of a band; of noise the first realisation."""
         index = self.tile * len(self.instrument.bands) + self.instrument.bands.index(band)
-        if index not in self.made and not self.coadds.has(index):
-            self.made[index] = self.coadds.load(index)
-        part = (rows, slice(None))
-        windows = {name: {"psf": (), "noise": (slice(0, 1), *part)}.get(name, part) for name in names}
-        if index in self.made:
-            found = {name: self.made[index][name][window].copy() for name, window in windows.items()}
-        else:
-            found = {name: self.coadds.load(index, (name,), window)[name] for name, window in windows.items()}
+        if index not in self.readers:
+            if self.coadds.has(index):
+                self.readers[index] = self.coadds.reader(index)
+            else:
+                made = self.coadds.load(index)
+                self.readers[index] = lambda name, part: made[name][(..., *part)].copy()
+        windows = {name: {"psf": (), "noise": (slice(0, 1), *window)}.get(name, window) for name in names}
+        found = {name: self.readers[index](name, part) for name, part in windows.items()}
         return {name: plane[0] if name == "noise" else plane for name, plane in found.items()}
 
     def layer(self, band: str) -> Layer:
@@ -47,13 +53,17 @@ class TileBands:
         rms = rms_of(noise, weight)
         error, mask = errors(weight, rms)
         ratios = noise_ratios(noise, error, mask)
-        image, psf = self.arrays(band, ("image", "psf")).values()
+        psf = self.arrays(band, ("psf",))["psf"]
+        spread = psf_scatter(noise, psf, error)
+        # before the image is read: the noise has told what it can
+        del noise, weight
+        give_back()
         rate = self.instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT
         exposures = None
         if self.instrument.coadd_from != "exposures":
             exposures, rate = self.arrays(band, ("nimages",))["nimages"], rate * VISIT
-        layer = Layer(image, error, mask, ratios, psf, 1.0, rate, rms, exposures)
-        return with_psf_ratio(layer, noise)
+        image = self.arrays(band, ("image",))["image"]
+        return Layer(image, error, mask, ratios, psf, spread, rate, rms, exposures)
 
     def detection(self) -> Layer:
         """Return the detection image: the median of bands, or their mean with inverse variances."""
@@ -67,18 +77,25 @@ class TileBands:
             shape = weight.shape
             del noise, weight, some
         image, noise, total = (np.empty(shape, np.float32) for _ in range(3))
-        for first in range(0, shape[0], _ROWS):
-            rows = slice(first, min(first + _ROWS, shape[0]))
-            parts = [self.arrays(band, ("image", "noise", "weight"), rows) for band in bands]
-            weights = [part["weight"] for part in parts]
+        for part in _blocks(shape):
+            parts = [self.arrays(band, ("image", "noise", "weight"), part) for band in bands]
+            weights = [one["weight"] for one in parts]
             if self.instrument.detection == "median":
-                image[rows], noise[rows] = (
-                    median([part[name] for part in parts], weights) for name in ("image", "noise")
+                image[part], noise[part] = (
+                    median([one[name] for one in parts], weights) for name in ("image", "noise")
                 )
-                total[rows] = sum(w / s for w, s in zip(weights, scales, strict=True) if s > 0) / len(bands)
+                total[part] = sum(w / s for w, s in zip(weights, scales, strict=True) if s > 0) / len(bands)
             else:
-                image[rows], total[rows] = weighted_mean([part["image"] for part in parts], weights, spreads)
-                noise[rows], _ = weighted_mean([part["noise"] for part in parts], weights, spreads)
+                image[part], total[part] = weighted_mean([one["image"] for one in parts], weights, spreads)
+                noise[part], _ = weighted_mean([one["noise"] for one in parts], weights, spreads)
         error, mask = errors(total, rms_of(noise, total))
         psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
         return Layer(image, error, mask, noise_ratios(noise, error, mask), psf)
+
+
+def _blocks(shape: tuple[int, int]) -> Iterator[Window]:
+    """Yield windows that cover a plane, of whole chunks: none is decoded twice."""
+    height, width = chunk_side(shape[0]), _CHUNKS * chunk_side(shape[1])
+    for top in range(0, shape[0], height):
+        for left in range(0, shape[1], width):
+            yield slice(top, top + height), slice(left, left + width)

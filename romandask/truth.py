@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import zarr
+from scipy.spatial import cKDTree
 
 from romandask.formats import spectra as spectra_files
 from romandask.generated import GenerateGalaxies, GenerateStars, NothingSetAside, matter, templates
 from romandask.incoming import Assemble, Quarantine, contents, edges_of, incoming, open_sources
+from romandask.kernels.photometry import Dust
 from romandask.kernels.scene import Truth, bind
 from romandask.model.config import TruthSettings
-from romandask.model.sky import Region, cell_area, cells_in_cone
+from romandask.model.sky import Region, cell_area, cells_in_cone, unit_vectors
 from romandask.model.spectra import Bandpass, SpectrumLibrary
 from romandask.runtime.manifest import digest
 from romandask.runtime.products import ImageProduct, TableProduct
@@ -66,6 +68,17 @@ class TruthCatalogs:
         both = [galaxies, stars.assign(star=True, redshift=0.0)]
         found = pd.concat([part for part in both if len(part)] or both, ignore_index=True)
         return found[["id", "star", "ra", "dec", "redshift", *fluxes]]
+
+    def milky_way(self, at: np.ndarray, ra: float, dec: float, radius: float) -> Dust:
+        """Return the Milky Way's dust at some places, (n, 3) unit vectors: that of the nearest galaxy around a cone.
+
+        Of a cone without galaxies nothing is known of it: NaN.
+        """
+        rows = _rows_near(self.galaxies, ra, dec, radius, ["ra", "dec", "MW_av", "MW_rv"])
+        if not len(rows):
+            return Dust(np.full(len(at), np.nan), np.full(len(at), 3.1))
+        _, near = cKDTree(unit_vectors(rows["ra"].to_numpy(), rows["dec"].to_numpy())).query(at)
+        return Dust(rows["MW_av"].to_numpy(float)[near], rows["MW_rv"].to_numpy(float)[near])
 
     def inputs(self, ra: float, dec: float, radius: float, stars_radius: float) -> tuple[tuple[str, str], ...]:
         """Return the units that `near` reads."""

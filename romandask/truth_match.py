@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from romandask.coadds import DrawTile, DrizzleTile
-from romandask.detections import DetectTile, owned
+from romandask.detections import DetectTile, owned, tile_cone
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Instrument
 from romandask.kernels.counterparts import counterparts
@@ -80,7 +80,7 @@ class MatchTile:
         _, tiles, render = _makers(self.detections)
         band = reference_band(render.instrument)
         objects = self.detections.load(index, ("objects",))["objects"]
-        true = render.truth.brief(*_cone(tiles, index)[:3], (band,))
+        true = render.truth.brief(*tile_cone(tiles, index)[:3], (band,))
         magnitude = ab_magnitude(objects[f"{band}_kronFlux"])
         found = counterparts(
             unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy()), magnitude,
@@ -111,7 +111,7 @@ class SummariseTile:
         """Return one row for each true object (schema: catalogs/truth_summary.yaml)."""
         maker, tiles, render = _makers(self.detections)
         bands, band = render.instrument.bands, reference_band(render.instrument)
-        true = render.truth.brief(*_cone(tiles, index)[:3], bands)
+        true = render.truth.brief(*tile_cone(tiles, index)[:3], bands)
         tile, grid = tiles.tiles[index], tiles.settings.grid()
         here = owned(true["ra"].to_numpy(), true["dec"].to_numpy(), tile, grid, maker.region)
         true = true[here & (ab_magnitude(true[f"flux_{band}"]) < self.settings.summary_magnitude)]
@@ -133,7 +133,7 @@ def _units(detections: ImageProduct, source: str, state: dict) -> tuple[Unit, ..
     """Return a unit a tile that reads the tile's unit of a stage and the truth on it."""
     _, tiles, render = _makers(detections)
     return tuple(
-        Unit(tile.name, {"tile": tile.name, **state}, ((source, tile.name), *render.truth.inputs(*_cone(tiles, k))))
+        Unit(tile.name, {"tile": tile.name, **state}, ((source, tile.name), *render.truth.inputs(*tile_cone(tiles, k))))
         for k, tile in enumerate(tiles.tiles)
     )
 
@@ -146,10 +146,3 @@ def _makers(detections: ImageProduct) -> tuple[DetectTile, DrawTile | DrizzleTil
     render = tiles.exposures.make
     assert isinstance(render, RenderExposure)
     return maker, tiles, render
-
-
-def _cone(tiles: DrawTile | DrizzleTile, index: int) -> tuple[float, float, float, float]:
-    """Return centre and radii (degrees) of the cone around the unique area of a tile, for galaxies and stars."""
-    tile, grid = tiles.tiles[index], tiles.settings.grid()
-    radius = (grid.inner / np.sqrt(2) + 5) / 3600
-    return tile.ra, tile.dec, radius, radius

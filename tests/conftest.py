@@ -33,7 +33,7 @@ def shared() -> Path:
     return SHARED
 
 
-def command(*arguments: str, cwd: Path | None = None, timeout: float = 600) -> subprocess.CompletedProcess:
+def command(*arguments: str, cwd: Path | None = None, timeout: float = 1800) -> subprocess.CompletedProcess:
     """Run the command line as a user would."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONWARNINGS"}
     return subprocess.run(

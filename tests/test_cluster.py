@@ -1,5 +1,7 @@
 """Runners: units that come after others, and what becomes of them when one fails."""
 
+import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import pyarrow as pa
 import pytest
 
 from romandask.runtime.cluster import ATTEMPTS, runner
+from romandask.runtime.order import Waiting
 from romandask.runtime.products import TableProduct
 from romandask.runtime.store import Store
 from romandask.runtime.units import Unit
@@ -52,3 +55,44 @@ def test_units_after_one_that_fails_are_given_up_and_named_and_others_are_made(t
     assert tries == (ATTEMPTS if workers else 1)
     for k in (0, 5):
         assert product.stored(store).load(k)["number"].tolist() == [k]
+
+
+@dataclass(frozen=True)
+class Slow:
+    """Makes a row of each unit, slowly, with the number of the process."""
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        time.sleep(0.4)
+        return pd.DataFrame({"process": np.array([os.getpid()], np.int64)})
+
+
+def test_the_last_of_a_few_long_units_does_not_wait_behind_another(tmp_path):
+    """Three units on two workers: the third goes to the worker that is free first, whatever dask thinks of them."""
+    units = tuple(Unit(f"u{k}", k) for k in range(3))
+    product = TableProduct("table/x", units, Slow(), pa.schema([("process", pa.int64())]), seconds_per_unit=60.0)
+    store = Store(tmp_path / "store")
+    with runner(2, 1.5) as execution:
+        tasks = [Task(k, "inputs", 1.0, f"kin {k % 2}") for k in range(3)]
+        found = list(execution.run(product, tasks, store))
+    assert all(outcome.record for outcome in found)
+    processes = [product.stored(store).load(k)["process"].iloc[0] for k in range(3)]
+    assert len(set(processes)) == 2
+
+
+def test_a_free_worker_goes_on_with_the_kin_that_it_knows():
+    tasks = [Task(k, "inputs", 1.0, kin) for k, kin in enumerate(["a", "a", "b", "b", "c"])]
+    waiting = Waiting(tasks)
+    assert waiting.next(None, ()).index == 0
+    # another worker begins with a kin that nobody works on, and goes on with it
+    assert waiting.next(None, {"a"}).index == 2
+    assert waiting.next("b", {"a"}).index == 3
+    assert waiting.next("b", {"a"}).index == 4
+    # rather than stand idle it helps with the other's
+    assert waiting.next("c", {"a"}).index == 1
+    assert not waiting
+
+
+def test_dear_tasks_come_first_and_none_before_what_it_comes_after():
+    tasks = [Task(0, "", 1.0, "x"), Task(1, "", 5.0, "y"), Task(2, "", 3.0, "x", after=(0,)), Task(3, "", 2.0, "z")]
+    waiting = Waiting(tasks)
+    assert [waiting.next().index for _ in tasks] == [1, 0, 2, 3]

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from romandask.kernels.extract import (
     ellipse_flux,
     kron_fluxes,
     psf_fluxes,
-    with_psf_ratio,
+    psf_scatter,
 )
 from romandask.kernels.layer import Layer, errors, median, noise_ratios, rms_of, weighted_mean
 
@@ -106,7 +107,8 @@ def test_quoted_errors_are_the_scatter_on_correlated_noise():
     weight = np.ones((SIDE, SIDE))
     weight[:, : SIDE // 2] = 2.0
     noise, other = (np.asarray(plane / np.sqrt(weight), np.float32) for plane in (noise, other))
-    layer = with_psf_ratio(layer_of(other, noise, weight), noise)
+    layer = layer_of(other, noise, weight)
+    layer = replace(layer, psf_ratio=psf_scatter(noise, layer.psf, layer.error))
     x, y = random.uniform(40, SIDE - 40, (2, 3000))
     for radius in (2.0, 5.0, 11.0):
         ones, nowhere = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)

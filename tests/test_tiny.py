@@ -231,3 +231,32 @@ def test_the_psf_of_the_coadds_is_written_for_other_tools(survey, tiny_store, tm
     wrong = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", "10", "10")
     assert wrong.returncode == 2
     assert wrong.stderr.startswith("error: (10.0, 10.0): outside the tiles")
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_extinction_is_what_the_milky_ways_dust_takes_from_the_counterparts(survey, truth, name):
+    joined = survey.objects_with_truth(name)
+    galaxies = joined[~joined["star"]].merge(truth[~truth["star"]], left_on="truth_id", right_on="galaxy_id")
+    assert len(galaxies) > 50
+    for band in survey.instruments[name].bands:
+        dimming = -2.5 * np.log10(galaxies[f"flux_{band}_y"] / galaxies[f"flux_{band}_noMW"])
+        # that of a flat spectrum; in blue bands a galaxy's colour changes it by some hundredths of itself
+        assert np.median(galaxies[f"{band}_extinction"] - dimming) == pytest.approx(0, abs=0.05 * dimming.median())
+        assert dimming.median() > 0
+
+
+@pytest.mark.parametrize("name", ["roman", "rubin"])
+def test_validation_agrees_with_the_noise_of_the_coadds(survey, name):
+    """Depth: that of a matched filter on white noise, less what the correlations of the noise cost."""
+    depth = survey.depths(name)
+    assert np.isfinite(depth).all()
+    for position, band in enumerate(survey.bands(name)):
+        tile = survey.coadds(name).isel(tile=0, band=position)
+        psf = tile["psf"].values.astype(float)
+        white = tile["noise"].values[0].std() / np.sqrt((psf**2).sum())
+        ideal = 31.4 - 2.5 * np.log10(5 * white)
+        assert -0.9 < depth[band] - ideal < 0.1
+    table = survey.residuals(name)
+    bright = table[table["magnitude"].between(20, 24) & (table["objects"] >= 10)]
+    assert len(bright) >= 3
+    assert bright["bias"].abs().max() < 0.3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import sep
@@ -152,18 +152,18 @@ def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
     return flux, np.sqrt((white * layer.psf_ratio) ** 2 + layer.poisson(flux, found.x, found.y))
 
 
-def with_psf_ratio(layer: Layer, noise: np.ndarray) -> Layer:
-    """Return a layer that knows how much larger the scatter of PSF fits to its noise is than that of white noise."""
+def psf_scatter(noise: np.ndarray, psf: np.ndarray, error: np.ndarray) -> float:
+    """Return how much larger the scatter of PSF fits to a noise realisation is than that of white noise.
+
+    `error` (ny, nx) is the rms of a pixel, 0 for no data.
+    """
     random = np.random.default_rng(0)
     ny, nx = noise.shape
     x, y = (random.uniform(PSF_RADIUS, n - 1 - PSF_RADIUS, TRIALS) for n in (nx, ny))
-    trial, norm = _psf_fit(noise, layer.psf, x, y)
-    pixel = at(layer.error, x, y)
+    trial, norm = _psf_fit(noise, psf, x, y)
+    pixel = at(error, x, y)
     good = (pixel > 0) & (norm > 0)
-    return replace(
-        layer,
-        psf_ratio=float(np.std(trial[good] * np.sqrt(norm[good]) / pixel[good])) if good.sum() > 50 else 1.0,
-    )
+    return float(np.std(trial[good] * np.sqrt(norm[good]) / pixel[good])) if good.sum() > 50 else 1.0
 
 
 def psf_half_light_radius(psf: np.ndarray) -> float:

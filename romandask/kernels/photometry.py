@@ -104,6 +104,20 @@ def transmission(law: str, wave: np.ndarray, av: float, rv: float) -> np.ndarray
     return 10 ** (-0.4 * av * (a + b / rv))
 
 
+def extinction(bandpass: Bandpass, milky_way: Dust) -> np.ndarray:
+    """Return by how many magnitudes (n,) the Milky Way's dust (F19) dims a source of flat f_nu in a band."""
+    av, ev = _columns(milky_way, "F19")
+    a, b = _curve("F19", bandpass.wave)
+    light = ab_photon_density(bandpass.wave) * bandpass.weights
+    out = np.zeros(len(av))
+    # some objects at a time: each has the whole band's wavelengths
+    for first in range(0, len(av), 8192):
+        rows = slice(first, first + 8192)
+        left = np.exp(-_TO_TAU * (av[rows, None] * a + ev[rows, None] * b))
+        out[rows] = -2.5 * np.log10(left @ light / light.sum())
+    return out
+
+
 @dataclass(frozen=True)
 class _Channels:
     """Weighted sums over cells: a band, or the share of a band that goes to one PSF node."""

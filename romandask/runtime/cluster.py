@@ -11,6 +11,7 @@ import socket
 import time
 import traceback
 import uuid
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -31,7 +32,10 @@ ATTEMPTS = 3
 PATIENCE = 60.0
 """Seconds that a run waits for a cluster without workers."""
 WAVE = 4
-"""Units in flight a worker: enough to keep it busy, few enough that nothing piles up."""
+"""Units in flight a thread of a worker: enough to keep it busy, few enough that nothing piles up."""
+LONG = 5.0
+"""Seconds: longer units are given out one a thread, to those that are free. One that waits behind another on its
+worker stays there, for dask moves only units of a kind that it has timed, and others would end with nothing to do."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +96,31 @@ class OnCluster:
         number = itertools.count()
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
+        places: dict[Any, str] = {}
+        known: dict[str, str] = {}
+
         def submit() -> None:
-            room = WAVE * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
-            while waiting and len(futures) < room:
-                task = waiting.next()
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+            threads = {address: worker["nthreads"] for address, worker in workers.items()}
+            total = max(1, sum(threads.values()))
+            long = product.seconds_per_unit > LONG
+            held = sum(any(k in flying for k in task.after) for task in futures.values())
+            while waiting and len(futures) < WAVE * total and len(futures) - held < (total if long else WAVE * total):
+                place = _freest(threads, places) if long else None
+                busy = {task.kin for task in futures.values()}
+                # what a worker knows of a kin, the PSFs of a detector for example, it need not find again
+                task = waiting.next(known.get(place), busy) if place else waiting.next()
                 tries[task.index] += 1
                 key = f"{name}-{product.names[task.index]}-{token}-{next(number)}"
                 # an edge of the graph for each unit that it comes after and that is not there yet
                 after = [flying[k] for k in task.after if k in flying]
-                future = self._client.submit(make_unit, shared, task, store, *after, key=key, pure=False)
+                where: dict[str, Any] = {"workers": [place], "allow_other_workers": True} if place else {}
+                future = self._client.submit(make_unit, shared, task, store, *after, key=key, pure=False, **where)
                 flying[task.index] = future
                 futures[future] = task
+                if place:
+                    places[future], known[place] = place, task.kin
+                held += bool(after)
                 future.add_done_callback(ended.put)
 
         try:
@@ -111,6 +129,7 @@ class OnCluster:
                 future = self._next(ended)
                 task = futures.pop(future)
                 del flying[task.index]
+                places.pop(future, None)
                 if future.status == "finished":
                     missing.discard(task.index)
                     yield Outcome(task.index, future.result())
@@ -162,6 +181,12 @@ def _after_failed(product: ImageProduct | TableProduct, failed: int) -> str:
 
 def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:
     return product
+
+
+def _freest(threads: dict[str, int], places: dict[Any, str]) -> str | None:
+    """Return the worker with the fewest tasks a thread; None without workers."""
+    tasks = Counter(places.values())
+    return min(threads, key=lambda address: tasks[address] / max(1, threads[address]), default=None)
 
 
 def _failure(future: Any) -> str:

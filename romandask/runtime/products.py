@@ -23,6 +23,7 @@ from romandask.runtime.manifest import Digest, digest, read_record
 from romandask.runtime.store import (
     Store,
     Variable,
+    few_chunks,
     open_images,
     read_parquet,
     write_array,
@@ -111,7 +112,8 @@ class ImageProduct:
             if name not in opened:
                 opened[name] = _array(group, name)
             index: Any = (*place, ..., *window)
-            return np.asarray(opened[name][index])
+            with few_chunks():
+                return np.asarray(opened[name][index])
 
         return read
 

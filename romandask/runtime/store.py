@@ -186,13 +186,22 @@ def open_images(
     return group
 
 
+def few_chunks() -> Any:
+    """Return a context in which zarr decodes two chunks at a time, not ten: their buffers are a quarter of a worker.
+
+    It takes no longer: one process has one core.
+    """
+    return zarr.config.set({"async.concurrency": 2})
+
+
 def write_array(array: zarr.Array, place: tuple[int, ...], values: np.ndarray) -> None:
     """Write the values of one unit, a file of its last two axes after another: what is written is in memory twice."""
     files = (array.shards or array.chunks)[len(place) :]
     cuts = [range(0, length, step) for length, step in zip(values.shape[-2:], files[-2:], strict=True)]
     for corner in itertools.product(*cuts):
         part: Any = (..., *(slice(low, low + step) for low, step in zip(corner, files[-2:], strict=True)))
-        array[(*place, *part)] = values[part]
+        with few_chunks():
+            array[(*place, *part)] = values[part]
 
 
 def write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict) -> None:
@@ -215,12 +224,12 @@ def _chunks(variable: Variable) -> tuple[tuple[int, ...], tuple[int, ...] | None
     """Return the shapes of the chunks of a unit and of its shards; None where there are none."""
     many, image = variable.shape[:-2], variable.shape[-2:]
     if not variable.compress:
-        return (*many, *(_inner_chunk(length, ROWS_A_FILE) for length in image[:-1]), image[-1]), None
-    inner = tuple(_inner_chunk(length) for length in image)
+        return (*many, *(chunk_side(length, ROWS_A_FILE) for length in image[:-1]), image[-1]), None
+    inner = tuple(chunk_side(length) for length in image)
     shard = (min(_SHARD, -(-length // chunk)) * chunk for length, chunk in zip(image, inner, strict=True))
     return (*(1 for _ in many), *inner), (*many, *shard)
 
 
-def _inner_chunk(length: int, about: int = 1024) -> int:
+def chunk_side(length: int, about: int = 1024) -> int:
     """Return a chunk of about some length that divides a length as evenly as it can."""
     return -(-length // max(1, round(length / about)))

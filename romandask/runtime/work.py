@@ -8,6 +8,7 @@ import warnings
 from dataclasses import dataclass
 
 from romandask.runtime.manifest import Record, write_record
+from romandask.runtime.memory import give_back
 from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.store import Store
 
@@ -47,4 +48,7 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
         warnings=sorted({f"{item.category.__name__}: {item.message}" for item in caught}),
     )
     write_record(store, record)
+    if record.seconds > 1:
+        # what lies free in the heap would be beside what the next unit takes
+        give_back()
     return record

@@ -17,7 +17,7 @@ from astropy.wcs import WCS
 from romandask.coadd_psfs import input_psf, psf_side
 from romandask.exposures import RenderExposure, cone, empty_variance, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrument, exposure_of, pixel_areas
-from romandask.kernels.detector import noise_realisation, usable
+from romandask.kernels.detector import SATURATED, noise_realisation, usable
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.fourier import POINT
 from romandask.kernels.pixel_map import PixelMap, Strip, pixel_map, strips
@@ -32,9 +32,9 @@ from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
 from romandask.model.tiles import Tile
 from romandask.pointings import corners_of
 from romandask.psfs import flat_shares
+from romandask.runtime.images import Coordinates, ImageProduct
 from romandask.runtime.manifest import digest
 from romandask.runtime.memory import give_back
-from romandask.runtime.products import Coordinates, ImageProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
 from romandask.runtime.units import LazyUnits, Unit
@@ -103,9 +103,9 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         (len(tiles), len(instrument.bands)),
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        # sums, sets and what is written at a time; the exposure that is added, its noise and its light
-        bytes_per_unit=pixels**2 * ((44 if drawn else 3) + 4 * planes)
-        + (0 if drawn else max(int(np.prod(instrument.shape)) * 22, pixels * 40_000))
+        # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
+        bytes_per_unit=pixels**2 * ((45 if drawn else 4) + 4 * planes)
+        + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 40_000))
         + (300 << 20 if drawn else 150 << 20),
         # a drizzled exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 6e-8 * float(mean)),
@@ -136,7 +136,7 @@ class DrizzleTile:
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages, set, PSFs and the table of sets."""
+        """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument = source.instrument
         k, b = divmod(index, len(instrument.bands))
@@ -154,15 +154,18 @@ class DrizzleTile:
             if parts[number]:
                 psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
         give_back()
-        sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac)
+        sums, dq = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac), np.zeros(shape, np.uint8)
         for i, exposure, header, part in zip(members, exposures, headers, parts, strict=True):
             planes: Iterable = []
             if part:
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
+                mark_saturated(dq, arrays["dq"], part, WCS(header), target)
                 planes = _planes_of(
                     arrays, part, instrument, exposure, header, target, source.seed, self.settings.noise
                 )
             sums.add(planes)
+        arrays, planes = {}, []
+        give_back()
         seconds = np.array([exposure.exptime for exposure in exposures])
         sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])
         count = sums.count
@@ -175,11 +178,32 @@ class DrizzleTile:
             "weight": sums.weight,
             "noise": np.stack(noise) if len(noise) > 1 else noise[0][None],
             "nimages": count,
+            "dq": dq,
             "set": sums.set,
             "psf": np.tensordot(used / max(used.sum(), 1e-30), psfs, 1).astype(np.float32),
             "input_psf": psfs,
             "sets": sets,
         }
+
+
+def mark_saturated(dq: np.ndarray, source: np.ndarray, parts: list[Strip], frame: WCS, target: WCS) -> None:
+    """Set, in its place, the bit of a tile's dq plane (uint8) around where pixels of an exposure are saturated.
+
+    They are left out of the mean, and what is left at a star's core is its fainter part.
+    """
+    for part in parts:
+        rows, columns = np.nonzero(source[part.rows, part.columns] & SATURATED)
+        if not len(rows):
+            continue
+        places = pixel_map(frame, target, part.rows, part.columns).at(
+            rows + part.rows.start, columns + part.columns.start
+        )
+        x, y = np.rint(places).astype(int).T
+        # a drop is less than two of the tile's pixels wide
+        for step_y, step_x in np.ndindex(3, 3):
+            v, u = y + step_y - 1, x + step_x - 1
+            inside = (v >= 0) & (u >= 0) & (v < dq.shape[0]) & (u < dq.shape[1])
+            dq[v[inside], u[inside]] |= SATURATED
 
 
 def most_inputs(members: dict[tuple[int, str], np.ndarray]) -> int:
@@ -223,7 +247,7 @@ class DrawTile:
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages, set, PSFs and the table of sets."""
+        """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument: Any = source.instrument
         k, b = divmod(index, len(instrument.bands))
@@ -241,7 +265,7 @@ class DrawTile:
         chosen_names = [self.exposures.names[i] for i in self.members[k, band]]
         exptimes = np.array([exposure.exptime for exposure in chosen])
         made = {
-            "weight": layers.weight, "nimages": layers.count, "set": layers.set,
+            "weight": layers.weight, "nimages": layers.count, "set": layers.set, "dq": np.zeros(shape, np.uint8),
             "sets": sets_table(layers.set, layers.sets, exptimes, chosen_names),
         }  # fmt: skip
         realisations = self.settings.noise
@@ -288,10 +312,9 @@ def _planes_of(
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray, PixelMap]]:
     """Yield, for each strip, image and noise realisations in nJy/arcsec2, weight and map onto the tile."""
     good = usable(arrays["dq"])
-    light = subtract_background(arrays["image"], ~good)
-    if "variance" not in arrays:
-        # nothing asks for it any more
-        del arrays["image"]
+    # where the variance is worked out from the image it is needed once more
+    image = arrays["image"].astype(np.float32) if "variance" in arrays else as_float(arrays.pop("image"))
+    light = subtract_background(image, ~good)
     to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
     identity = ("noise", instrument.name, exposure.visit, exposure.detector)
     wcs = WCS(header)
@@ -311,9 +334,19 @@ def _planes_of(
         yield [light[here] * scale, *(plane * scale for plane in noise)], weight, pixel_map(wcs, target, *here)
 
 
-def subtract_background(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return an exposure (float32, electrons) less its background, estimated from the image itself on a coarse mesh."""
-    light = image.astype(np.float32)
+def as_float(image: np.ndarray) -> np.ndarray:
+    """Return an image as float32, in its own place where its pixels have four bytes: it is of no use any more."""
+    if image.dtype.itemsize != 4 or not image.flags.writeable:
+        return image.astype(np.float32)
+    light = image.view(np.float32)
+    # some rows at a time, for a copy of each is made on the way
+    for first in range(0, len(image), 256):
+        light[first : first + 256] = image[first : first + 256].astype(np.float32)
+    return light
+
+
+def subtract_background(light: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return an exposure (float32, electrons), changed, less its background, estimated from it on a coarse mesh."""
     background = sep.Background(light, mask=mask, bw=BACKGROUND_MESH, bh=BACKGROUND_MESH)
     background.subfrom(light)
     return light
@@ -342,6 +375,7 @@ def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Vari
     """Return the arrays of a tile: `inputs` exposures at most are drizzled, or None where tiles are drawn."""
     shape, axes = (pixels, pixels), ("y", "x")
     text = "noise realisations with the image's correlations"
+    flags = {"flag_masks": [SATURATED], "flag_meanings": "saturated"}
     found = [
         Variable("image", "float32", shape, axes, {"units": "nJy", "long_name": "flux of a pixel"}),
         Variable(
@@ -350,6 +384,7 @@ def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Vari
         ),
         Variable("noise", "float32", (noise, *shape), ("realisation", *axes), {"units": "nJy", "long_name": text}),
         Variable("nimages", "uint8", shape, axes, {"long_name": "number of exposures"}),
+        Variable("dq", "uint8", shape, axes, {"long_name": "data quality", **flags}),
         Variable("set", "uint16", shape, axes, {"long_name": "number of the set of exposures"}),
         Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star of flat f_nu, mean over the tile"}),
     ]  # fmt: skip

@@ -22,8 +22,9 @@ from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs
 from romandask.pointings import corners_of
 from romandask.psfs import flat_shares
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
-from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.tables import TableProduct
 
 EXPOSURE_LAYERS = {
     "background": ("float32", "electron", "expected electrons that do not come from objects"),

@@ -10,7 +10,9 @@ from astropy.wcs import WCS
 
 from romandask.coadds import DrawTile, DrizzleTile
 from romandask.exposures import RenderExposure
+from romandask.kernels.detector import SATURATED
 from romandask.kernels.extract import (
+    SATURATED_CORE,
     Found,
     aperture_fluxes,
     detect,
@@ -24,10 +26,11 @@ from romandask.model.config import DetectionSettings
 from romandask.model.sky import Region, cells_in_cone, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
 from romandask.runtime.hats import with_spatial_index
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
-from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands
 from romandask.zero_points import corrected
@@ -202,6 +205,8 @@ def measure(
         )
         columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(layer, found)
         del layer
+        saturated = segments[(bands.arrays(band, ("dq",))["dq"] & SATURATED) > 0]
+        flags[np.isin(found.label, saturated)] |= SATURATED_CORE
     frame = pd.DataFrame(columns | {"flags": flags})
     return with_spatial_index(frame, "coord_ra", "coord_dec")
 

@@ -14,7 +14,7 @@ from romandask.kernels.sca import count_rate_nonlinearity, expand, quantum_effic
 from romandask.kernels.sca_exposure import Planes, Response, accumulate, afterglow, read_out
 from romandask.kernels.synthetic_sca import BORDER, REFERENCE, SIDE
 from romandask.readout import age_and_traps
-from romandask.runtime.products import ImageProduct
+from romandask.runtime.images import ImageProduct
 
 _ALONE = np.pad(np.ones((1, 1), np.float32), 1)[:, :, None, None]
 """The kernel (3, 3) of a pixel that keeps what it has."""

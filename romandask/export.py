@@ -13,7 +13,7 @@ import xarray as xr
 from romandask.cutouts import Wanted, located
 from romandask.formats import meds, obseq, psf_image, truth_files
 from romandask.model.errors import UserError
-from romandask.runtime.products import TableProduct
+from romandask.runtime.tables import TableProduct
 from romandask.survey import Survey
 
 

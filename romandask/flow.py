@@ -14,11 +14,12 @@ from romandask.model.errors import UserError
 from romandask.pipeline import Pipeline
 from romandask.runtime.cluster import Runner
 from romandask.runtime.hats import margin, write_catalog_files
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
 from romandask.runtime.manifest import digest, read_record
-from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.progress import Reporter
 from romandask.runtime.store import MARGIN, Store, write_bytes, write_json
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.work import Task
 from romandask.survey import Survey
 from romandask.truth import write_spectra
@@ -87,6 +88,8 @@ _SETTING = {
     "truth": "raise truth.order",
     "objects": "raise detections.order",
     "matches": "raise matches.order",
+    "chance": "raise matches.order",
+    "samples": "raise detections.order",
     "exposures": "lower render.largest",
     "truth_index": "lower render.largest",
 }
@@ -126,14 +129,20 @@ def stages(survey: Survey) -> list[Stage]:
     for name in names:
         found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
     if {"roman", "rubin"} <= set(names):
-        found += [
-            Stage(f"matches/{part}", lambda s, part=part: getattr(s.match_products, part))
-            for part in ("local", "crossing", "merged")
-        ]
-        found += _with_margin("matches/groups", lambda s: s.match_products.groups, ("coord_ra", "coord_dec"))
+        for name in names:
+            found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
+            sample = f"samples/{name}"
+            found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
+        for kind, products in (("matches", "match_products"), ("chance", "chance_products")):
+            found += [
+                Stage(f"{kind}/{part}", lambda s, products=products, part=part: getattr(getattr(s, products), part))
+                for part in ("local", "crossing", "merged")
+            ]
+            groups = f"{kind}/groups"
+            found += _with_margin(groups, lambda s, p=products: getattr(s, p).groups, ("coord_ra", "coord_dec"))
         found += [
             Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
-            for part in ("blends", "unrecognised")
+            for part in ("blends", "unrecognised", "distributions", "chance")
         ]
     return found
 
@@ -331,7 +340,10 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
                 "coadds",
                 "detections",
                 "objects",
+                "limits",
+                "samples",
                 "matches",
+                "chance",
                 "statistics",
             )
         )

@@ -19,8 +19,8 @@ from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass, SpectrumLibrary
 from romandask.runtime.hats import with_spatial_index
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
-from romandask.runtime.products import ImageProduct
 from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 

@@ -20,8 +20,8 @@ from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, SpectrumLibrary
 from romandask.runtime.hats import with_spatial_index
-from romandask.runtime.products import TableProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
 SPECTRA = ("bulge_sed", "disk_sed", "knots_sed", "sed")

@@ -1,25 +1,31 @@
-"""Matches: friends of friends over the objects of all surveys, for several linking lengths, over any partitions.
+"""Matches: friends of friends over the objects of all surveys, for any linking length, over any partitions.
 
-Every partition labels its own objects and lists the links that cross its border; the labels that these links touch are
-merged; every partition is relabelled. The groups equal those of one piece, whatever the partitions.
+Every partition grows the minimum spanning forest of its own objects and lists the links that cross its border; the
+forests that these links touch are grown together; every partition names its groups. The groups equal those of one
+piece, whatever the partitions; shorter linking lengths than the longest are the same forest, cut.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cdshealpix.nested as healpix
 import numpy as np
 import pandas as pd
 
-from romandask.kernels.groups import label, links, merge, relabel
+from romandask.kernels.groups import forest, label, links
 from romandask.model.config import MatchSettings
 from romandask.model.errors import UserError
-from romandask.model.sky import Region, cells_in_cone, unit_vectors
-from romandask.runtime.products import TableProduct
+from romandask.model.sky import Region, unit_vectors
+from romandask.runtime.hats import RIM, RIM_ORDER, inner_rim, rim
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
+
+SHIFT = 13.0
+"""Arcsec by which a survey is moved to count what chance makes."""
+CODES = 8
+"""A key is this many times the objectId, and the code of the survey."""
 
 
 @dataclass(frozen=True)
@@ -27,79 +33,65 @@ class Matches:
     """The stages of friends of friends, in order."""
 
     local: TableProduct
-    """Objects with the labels of their own partition."""
+    """Objects with the forest of their own partition."""
     crossing: TableProduct
     """Links between partitions."""
     merged: TableProduct
-    """Labels that become others; one unit a linking length."""
+    """The forest of the groups that cross borders."""
     groups: TableProduct
-    """Objects with their groups."""
+    """Objects with the whole forest and their groups."""
 
 
 def matches(
-    objects: dict[str, TableProduct], settings: MatchSettings, region: Region, store: Store | None = None
-) -> Matches:
+    objects: dict[str, TableProduct], settings: MatchSettings, region: Region, store: Store | None = None,
+    kind: str = "matches", shift: float = 0.0,
+) -> Matches:  # fmt: skip
     """Return the lazy groups of the object tables of several surveys.
 
     Parameters
     ----------
-    objects : object tables by survey name; the order gives each survey its code in `key`
+    objects : tables by survey name, with objectId, coord_ra, coord_dec; the order gives each survey its code in `key`
     store : where the stages before the last are read, where they are stored
+    kind : first part of the names of the stages
+    shift : by so much, arcsec, the second survey is moved: of real groups nothing is left, only what chance makes
+
+    Raises
+    ------
+    UserError
+        If a linking length is longer than what is looked at around a partition.
     """
+    most = RIM - SHIFT
+    if max(settings.linking_lengths) > most:
+        raise UserError(f"matches.linking_lengths: {max(settings.linking_lengths):g} arcsec, {most:g} at most")
     cells = tuple(map(int, region.cells(settings.order)))
-    state = {"settings": settings.model_dump(), "surveys": list(objects)}
-    around = {cell: _neighbours(cell, settings) for cell in cells}
-    sources = []
-    for cell in cells:
-        inputs = []
-        for product in objects.values():
-            pixels = _pixels(product, around[cell], settings.order)
-            inputs += [
-                (product.stage, unit.name)
-                for unit, pixel in zip(product.units, product.pixels or (), strict=True)
-                if pixel in pixels
-            ]
-        sources.append(tuple(inputs))
-    names = [f"{settings.order}-{cell}" for cell in cells]
-    units = tuple(
-        Unit(name, {**state, "cell": cell}, inputs) for name, cell, inputs in zip(names, cells, sources, strict=True)
-    )
-    common = (objects, settings, cells, around)
     lengths = settings.linking_lengths
     columns = tuple(map(length_name, lengths))
-    size = 500 << 20
+    state = {"longest": max(lengths), "order": settings.order, "surveys": list(objects), "shift": shift}
+    names = [f"{settings.order}-{cell}" for cell in cells]
+    size, parts = 300 << 20, _Partitions(objects, max(lengths), settings.order, cells, shift)
     local = TableProduct(
-        "matches/local", units, _Local(*common), schema("local", columns), bytes_per_unit=size, store=store
-    )
+        f"{kind}/local",
+        tuple(Unit(name, state, parts.inputs(cell)) for name, cell in zip(names, cells, strict=True)),
+        _Local(parts), schema("local"), cells, settings.order, size, store=store,
+    )  # fmt: skip
     crossing = TableProduct(
-        "matches/crossing", units, _Crossing(*common), schema("crossing"), bytes_per_unit=size, store=store
-    )
+        f"{kind}/crossing",
+        tuple(Unit(name, state, parts.inputs(cell, True)) for name, cell in zip(names, cells, strict=True)),
+        _Crossing(parts), schema("crossing"), bytes_per_unit=size, store=store,
+    )  # fmt: skip
     upstream = tuple((product.stage, unit.name) for product in (local, crossing) for unit in product.units)
     merged = TableProduct(
-        "matches/merged",
-        tuple(Unit(name, {**state, "length": name}, upstream) for name in columns),
-        _Merge(local, crossing, lengths),
-        schema("merged"),
-        bytes_per_unit=size,
-        store=store,
-    )
+        f"{kind}/merged", (Unit("all", state, upstream),), _Merge(local, crossing), schema("merged"),
+        bytes_per_unit=size, store=store,
+    )  # fmt: skip
     groups = TableProduct(
-        "matches/groups",
+        f"{kind}/groups",
         tuple(
-            Unit(
-                name,
-                {**state, "cell": cell},
-                (("matches/local", name), *(("matches/merged", column) for column in columns)),
-            )
-            for name, cell in zip(names, cells, strict=True)
+            Unit(name, {**state, "lengths": lengths}, ((local.stage, name), (merged.stage, "all"))) for name in names
         ),
-        _Relabel(local, merged, columns),
-        schema("groups", columns),
-        cells,
-        settings.order,
-        size,
+        _Name(local, merged, tuple(objects), lengths), schema("groups", columns), cells, settings.order, size,
         store=store,
-    )
+    )  # fmt: skip
     return Matches(local, crossing, merged, groups)
 
 
@@ -108,124 +100,140 @@ def length_name(length: float) -> str:
     return f"{round(length * 1000)}mas"
 
 
+def group_of(groups: pd.DataFrame, merged: pd.DataFrame, length: float) -> np.ndarray:
+    """Return the smallest key of the group of each object of a partition.
+
+    Parameters
+    ----------
+    groups : rows with key, into, joined (matches/local or matches/groups)
+    merged : the table matches/merged
+    length : arcsec, no longer than the longest linking length of the survey
+    """
+    # the rows of groups that cross borders stand in `merged`, wherever their objects are
+    own = groups.loc[~np.isin(groups["key"].to_numpy(), merged["key"].to_numpy()), ["key", "into", "joined"]]
+    every = pd.concat([own, merged[["key", "into", "joined"]]] if len(merged) else [own]).sort_values("key")
+    key = every["key"].to_numpy()
+    first = label(np.searchsorted(key, every["into"].to_numpy()), every["joined"].to_numpy(), length)
+    return key[first[np.searchsorted(key, groups["key"].to_numpy())]]
+
+
 @dataclass(frozen=True)
-class _Partition:
+class _Partitions:
+    """The objects of several catalogs, cut anew."""
+
     objects: dict[str, TableProduct]
-    settings: MatchSettings
+    longest: float
+    order: int
     cells: tuple[int, ...]
-    around: dict[int, set[int]]
+    shift: float = 0.0
 
-    def rows(self, index: int) -> tuple[pd.DataFrame, np.ndarray]:
-        """Return the objects in and around a partition, sorted by key, and which are its own."""
-        cell = self.cells[index]
+    def inputs(self, cell: int, around: bool = False) -> tuple[tuple[str, str], ...]:
+        """Return the units that hold the objects of a cell, and around it."""
+        return tuple(
+            (product.stage, product.names[k])
+            for product in self.objects.values()
+            for k in sorted({*product.touching_cells(np.array([cell]), self.order),
+                             *(product.touching_cells(rim(cell, self.order), RIM_ORDER) if around else ())})
+        )  # fmt: skip
+
+    def rows(self, cells: np.ndarray, order: int) -> pd.DataFrame:
+        """Return the objects of some cells, by key, with columns key, coord_ra, coord_dec and _healpix_29."""
         parts = []
-        shift = 2 * (29 - self.settings.order)
-        for code, (survey, product) in enumerate(self.objects.items()):
-            wanted = _pixels(product, self.around[cell], self.settings.order)
-            for k, pixel in enumerate(product.pixels or ()):
-                if pixel not in wanted:
-                    continue
-                frame = product.load(k)[["objectId", "coord_ra", "coord_dec", "_healpix_29"]]
-                here = np.isin(frame["_healpix_29"].to_numpy() >> shift, list(self.around[cell]))
-                key = frame["objectId"].to_numpy() * 8 + code
-                parts.append(frame.assign(key=key, survey=survey)[here])
-        frame = pd.concat(parts, ignore_index=True) if parts else schema("groups").empty_table().to_pandas()
-        frame = frame.sort_values("key", ignore_index=True)
-        return frame, frame["_healpix_29"].to_numpy() >> shift == cell
+        for code, product in enumerate(self.objects.values()):
+            frame = product.rows_in(cells, order, ["objectId", "coord_ra", "coord_dec"])
+            if code == 1 and self.shift:
+                # towards the equator: nowhere over a pole
+                dec = frame["coord_dec"]
+                frame["coord_dec"] = dec - np.where(dec > 0, 1, -1) * self.shift / 3600
+            parts.append(frame.assign(key=frame["objectId"].to_numpy(np.int64) * CODES + code))
+        return pd.concat(parts, ignore_index=True).sort_values("key", ignore_index=True).drop(columns="objectId")
 
-    def pairs(self, index: int) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, which are its own, the pairs within the largest linking length, and their separations."""
-        frame, own = self.rows(index)
-        found, gap = links(unit_vectors(frame["coord_ra"], frame["coord_dec"]), max(self.settings.linking_lengths))
-        return frame, own, found, gap
+    def own(self, index: int) -> pd.DataFrame:
+        """Return the objects of a partition."""
+        return self.rows(np.array([self.cells[index]]), self.order)
 
 
-class _Local(_Partition):
+@dataclass(frozen=True)
+class _Local:
+    parts: _Partitions
+
     def __call__(self, index: int) -> pd.DataFrame:
-        frame, own, found, gap = self.pairs(index)
-        place = np.cumsum(own) - 1
-        inside = own[found].all(axis=1)
-        mine = frame[own].reset_index(drop=True)
-        for length in self.settings.linking_lengths:
-            pairs = place[found[inside & (gap <= length)]]
-            mine[f"label_{length_name(length)}"] = label(mine["key"].to_numpy(), pairs)
-        return mine
+        frame = self.parts.own(index)
+        found = links(unit_vectors(frame["coord_ra"], frame["coord_dec"]), self.parts.longest)
+        into, joined = forest(len(frame), *found)
+        frame = frame.assign(into=frame["key"].to_numpy()[into], joined=joined)
+        return frame.sort_values(["_healpix_29", "key"], ignore_index=True)
 
 
-class _Crossing(_Partition):
+@dataclass(frozen=True)
+class _Crossing:
+    parts: _Partitions
+
     def __call__(self, index: int) -> pd.DataFrame:
-        frame, own, found, gap = self.pairs(index)
-        keys = frame["key"].to_numpy()
-        # each crossing link is listed once, by the partition of its smaller key
-        across = own[found[:, 0]] != own[found[:, 1]]
-        low = np.where(keys[found[:, 0]] < keys[found[:, 1]], 0, 1)
-        mine = across & own[np.take_along_axis(found, low[:, None], axis=1)[:, 0]]
-        ends = np.sort(keys[found[mine]], axis=1)
-        return pd.DataFrame({"key_1": ends[:, 0], "key_2": ends[:, 1], "separation": gap[mine]}).sort_values(
-            ["key_1", "key_2"]
+        own, outside = (
+            self.parts.rows(cells(self.parts.cells[index], self.parts.order), RIM_ORDER) for cells in (inner_rim, rim)
         )
+        vectors = [unit_vectors(frame["coord_ra"], frame["coord_dec"]) for frame in (own, outside)]
+        keys = np.concatenate([own["key"].to_numpy(), outside["key"].to_numpy()])
+        pairs, gap = links(np.concatenate(vectors), self.parts.longest)
+        inside = pairs < len(own)
+        across = inside[:, 0] != inside[:, 1]
+        pairs, gap = pairs[across], gap[across]
+        mine = np.where(inside[across, 0], pairs[:, 0], pairs[:, 1])
+        other = np.where(inside[across, 0], pairs[:, 1], pairs[:, 0])
+        # both partitions meet a link: it is listed by that of its smaller key
+        first = keys[mine] < keys[other]
+        ends = {"key_1": keys[mine][first], "key_2": keys[other][first], "separation": gap[first]}
+        return pd.DataFrame(ends).sort_values(["key_1", "key_2"])
 
 
 @dataclass(frozen=True)
 class _Merge:
     local: TableProduct
     crossing: TableProduct
-    lengths: tuple[float, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
-        length = self.lengths[index]
         edges = self.crossing.all_rows()
-        edges = edges[edges["separation"] <= length]
-        touched = np.unique(edges[["key_1", "key_2"]].to_numpy())
-        keys, labels = [], []
+        ends = np.unique(edges[["key_1", "key_2"]].to_numpy())
+        parts = []
         for k in range(len(self.local.units)):
-            frame = self.local.load(k)
-            frame = frame[np.isin(frame["key"].to_numpy(), touched)]
-            keys.append(frame["key"].to_numpy())
-            labels.append(frame[f"label_{length_name(length)}"].to_numpy())
-        key, found = np.concatenate(keys), np.concatenate(labels)
-        order = np.argsort(key)
-        key, found = key[order], found[order]
-        first, second = (found[np.searchsorted(key, edges[name].to_numpy())] for name in ("key_1", "key_2"))
-        before, after = merge(first, second)
-        return pd.DataFrame({"label": before, "group": after})
+            frame = self.local.select(k, ["key", "into", "joined"]).sort_values("key", ignore_index=True)
+            key = frame["key"].to_numpy()
+            if len(key) and ends.searchsorted(key[-1], "right") > ends.searchsorted(key[0]):
+                # all of a group that a link touches: its forest may grow otherwise
+                group = label(np.searchsorted(key, frame["into"].to_numpy()), frame["joined"].to_numpy(), np.inf)
+                touched = np.zeros(len(key), bool)
+                touched[group[np.isin(key, ends)]] = True
+                parts.append(frame[touched[group]])
+        if not parts:
+            return pd.DataFrame({"key": np.empty(0, np.int64), "into": np.empty(0, np.int64), "joined": np.empty(0)})
+        rows = pd.concat(parts).sort_values("key", ignore_index=True)
+        key = rows["key"].to_numpy()
+        grown = np.isfinite(rows["joined"].to_numpy())
+        first = np.concatenate([key[grown], edges["key_1"].to_numpy()])
+        second = np.concatenate([rows["into"].to_numpy()[grown], edges["key_2"].to_numpy()])
+        gap = np.concatenate([rows["joined"].to_numpy()[grown], edges["separation"].to_numpy()])
+        into, joined = forest(len(key), np.stack([np.searchsorted(key, first), np.searchsorted(key, second)], 1), gap)
+        return pd.DataFrame({"key": key, "into": key[into], "joined": joined})
 
 
 @dataclass(frozen=True)
-class _Relabel:
+class _Name:
     local: TableProduct
     merged: TableProduct
-    columns: tuple[str, ...]
+    surveys: tuple[str, ...]
+    lengths: tuple[float, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
-        frame = self.local.load(index)
-        for k, column in enumerate(self.columns):
-            table = self.merged.load(k)
-            frame[f"group_{column}"] = relabel(
-                frame[f"label_{column}"].to_numpy(), table["label"].to_numpy(), table["group"].to_numpy()
-            )
-        return frame.sort_values(["_healpix_29", "key"], ignore_index=True)
-
-
-def _neighbours(cell: int, settings: MatchSettings) -> set[int]:
-    """Return the cell and those that its margin, as wide as the largest linking length, may reach."""
-    # the cone holds every cell within a third of a cell of this one, whatever its shape
-    if max(settings.linking_lengths) > 3600 * 18 / 2**settings.order:
-        raise UserError("matches.linking_lengths exceed the HEALPix cells of matches.order: lower matches.order")
-    lon, lat = _centre(cell, settings.order)
-    radius = np.degrees(1.8 * np.sqrt(4 * np.pi / (12 * 4**settings.order)))
-    return set(map(int, cells_in_cone(lon, lat, radius, settings.order)))
-
-
-def _pixels(product: TableProduct, cells: set[int], order: int) -> set[int]:
-    """Return the partitions of a catalog, of whatever order, that overlap some cells."""
-    own = product.order or 0
-    if own <= order:
-        return {cell >> (2 * (order - own)) for cell in cells}
-    step = 2 * (own - order)
-    return {pixel for pixel in product.pixels or () if pixel >> step in cells}
-
-
-def _centre(cell: int, order: int) -> tuple[float, float]:
-    lon, lat = healpix.healpix_to_lonlat(np.array([cell], np.uint64), order)
-    return float(lon.to_value("deg")[0]), float(lat.to_value("deg")[0])
+        frame, merged = self.local.load(index), self.merged.load(0)
+        key = frame["key"].to_numpy()
+        place = np.minimum(np.searchsorted(merged["key"].to_numpy(), key), max(len(merged) - 1, 0))
+        if len(merged):
+            known = merged["key"].to_numpy()[place] == key
+            for name in ("into", "joined"):
+                frame[name] = np.where(known, merged[name].to_numpy()[place], frame[name].to_numpy())
+        frame["survey"] = np.array(self.surveys, object)[key % CODES]
+        frame["objectId"] = key // CODES
+        for length in self.lengths:
+            frame[f"group_{length_name(length)}"] = group_of(frame, merged, length)
+        return frame

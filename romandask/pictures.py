@@ -278,19 +278,40 @@ def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
     return _png(figure)
 
 
-def blend_fraction(tables: dict[float, pd.DataFrame]) -> bytes:
-    """Return the fraction of unrecognised blends against i magnitude, with binomial errors, by linking length."""
+def blend_fraction(tables: dict[float, pd.DataFrame], chance: dict[float, pd.DataFrame]) -> bytes:
+    """Return the fraction of unrecognised blends against i magnitude, with binomial errors, by linking length.
+
+    `chance` are the same tables of a moved sky: of them the share with any Roman object is shown.
+    """
     figure = _figure(6.5, 4)
     axes = figure.add_subplot()
-    for length, table in tables.items():
+    for number, (length, table) in enumerate(tables.items()):
         good = table[table["rubin_objects"] > 0]
         middle = (good["i_mag_low"] + good["i_mag_high"]) / 2
-        error = np.sqrt(good["fraction"] * (1 - good["fraction"]) / good["rubin_objects"])
-        axes.errorbar(middle, good["fraction"], error, marker="o", capsize=2, label=f"{length:g} arcsec")
-    axes.set_xlabel("Rubin i, Kron AB mag")
+        colour, name = f"C{number}", f"{length:g} arcsec"
+        axes.errorbar(middle, good["fraction"], good["error"], marker="o", capsize=2, color=colour, label=name)
+        moved = chance[length].loc[good.index]
+        axes.plot(middle, moved["with_roman"] / moved["rubin_objects"], ":", color=colour)
+    axes.set_xlabel("Rubin i, Kron AB mag, dereddened")
     axes.set_ylabel("unrecognised blends / Rubin objects")
     axes.set_ylim(0, 1)
     axes.legend()
+    return _png(figure)
+
+
+def blend_distributions(table: pd.DataFrame) -> bytes:
+    """Return distributions of colour and size of blends and of single objects (statistics/distributions)."""
+    figure = _figure(10, 3.4)
+    labels = {"colour": "g - F184, AB mag", "size": "half-light radius in Rubin, arcsec"}
+    for position, (quantity, label) in enumerate(labels.items()):
+        axes = figure.add_subplot(1, 2, position + 1)
+        rows = table[table["quantity"] == quantity]
+        edges = np.append(rows["low"], rows["high"].iloc[-1:])
+        for column, colour in (("singles", "tab:blue"), ("blends", "tab:red")):
+            total = rows[column].sum()
+            axes.stairs(rows[column] / max(total, 1), edges, color=colour, label=f"{column}: {total}")
+        axes.set_xlabel(label)
+        axes.legend(fontsize=8)
     return _png(figure)
 
 

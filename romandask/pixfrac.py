@@ -14,7 +14,7 @@ from romandask.kernels.drizzle import Sums
 from romandask.kernels.pixel_map import pixel_map, strips
 from romandask.model.errors import UserError
 from romandask.model.tiles import tangent_header
-from romandask.runtime.products import ImageProduct
+from romandask.runtime.images import ImageProduct
 
 CHOICES = np.round(np.arange(0.3, 1.001, 0.1), 1)
 UNEVEN = 0.2

@@ -31,7 +31,7 @@ from romandask.kernels.sca_exposure import (
 )
 from romandask.kernels.synthetic_sca import SIDE, WAVES
 from romandask.model.seeds import rng
-from romandask.runtime.products import ImageProduct
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.store import ROWS_A_FILE
 
 DAY = 86400.0

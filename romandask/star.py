@@ -17,7 +17,7 @@ from romandask.kernels.coadd_psf import drizzled_psf
 from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
 from romandask.psfs import OVERSAMPLING, psf_image
-from romandask.runtime.products import ImageProduct
+from romandask.runtime.images import ImageProduct
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
 """Photons per nm, in any unit, at wavelengths in nm: a `galsim.SED`, for example."""

@@ -12,12 +12,14 @@ import pandas as pd
 import xarray as xr
 
 from romandask.cutouts import Positions, Wanted, cutouts, located
+from romandask.matches import group_of
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.pipeline import load_pipeline
 from romandask.pointings import visits
 from romandask.runtime.manifest import read_record
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
 from romandask.star import Spectrum, coadd_psf
 from romandask.statistics import Statistics, matrix
 from romandask.survey_products import SurveyProducts
@@ -163,9 +165,24 @@ class Survey(SurveyProducts):
         """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
         return self.object_product(survey).frame
 
-    def matches(self) -> dd.DataFrame:
-        """Return the lazy friends-of-friends groups of all objects (schema: catalogs/groups.yaml)."""
-        return self.match_products.groups.frame
+    def sample(self, survey: str) -> dd.DataFrame:
+        """Return the lazy sample of a survey's objects that the groups are made of (schema: catalogs/samples.yaml)."""
+        return self.sample_product(survey).frame
+
+    def matches(self, linking_length: float | None = None) -> dd.DataFrame:
+        """Return the lazy friends-of-friends groups of the samples of all surveys (schema: catalogs/groups.yaml).
+
+        With a linking length (arcsec, no longer than the longest of the pipeline) the column `group` has the groups of
+        that length: the stored forest, cut there.
+        """
+        products, longest = self.match_products, max(self.pipeline.matches.linking_lengths)
+        frame = products.groups.frame
+        if linking_length is None:
+            return frame
+        if not 0 < linking_length <= longest:
+            raise UserError(f"linking length {linking_length:g}: this survey's forest ends at {longest:g} arcsec")
+        meta = frame._meta.assign(group=np.empty(0, np.int64))
+        return frame.map_partitions(_with_group, products.merged.load(0), linking_length, meta=meta)
 
     @property
     def statistics(self) -> SurveyStatistics:
@@ -198,14 +215,29 @@ class SurveyStatistics:
 
     def unrecognised(self, linking_length: float | None = None) -> pd.DataFrame:
         """Return unrecognised blends by i magnitude (schema: catalogs/unrecognised.yaml)."""
-        table = self._products.unrecognised.all_rows()
-        return table[np.isclose(table["linking_length"], self._length(linking_length))].reset_index(drop=True)
+        return self._of(self._products.unrecognised, linking_length)
+
+    def chance(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return what `unrecognised` is where Rubin's objects are moved, so that chance alone makes groups."""
+        return self._of(self._products.chance, linking_length)
+
+    def distributions(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return colours and sizes of blends and of single objects (schema: catalogs/distributions.yaml)."""
+        return self._of(self._products.distributions, linking_length)
+
+    def _of(self, product: TableProduct, length: float | None) -> pd.DataFrame:
+        table = product.all_rows()
+        return table[np.isclose(table["linking_length"], self._length(length))].reset_index(drop=True)
 
     def _length(self, length: float | None) -> float:
         length = self._lengths[0] if length is None else length
         if not np.isclose(length, self._lengths).any():
             raise UserError(f"linking length {length}: this survey has {', '.join(map(str, self._lengths))} arcsec")
         return length
+
+
+def _with_group(groups: pd.DataFrame, merged: pd.DataFrame, length: float) -> pd.DataFrame:
+    return groups.assign(group=group_of(groups, merged, length))
 
 
 def open_survey(path: str | Path) -> Survey:

@@ -15,7 +15,7 @@ from romandask.detections import detections, objects
 from romandask.exposures import exposures
 from romandask.incoming import incoming, open_sources
 from romandask.instruments.exposure import Instrument
-from romandask.matches import Matches, matches
+from romandask.matches import SHIFT, Matches, matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
@@ -23,15 +23,17 @@ from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline
 from romandask.pointings import pointings
 from romandask.psfs import psfs
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import read_record
-from romandask.runtime.products import ImageProduct, TableProduct, conform, to_frame
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store, read_parquet
+from romandask.runtime.tables import TableProduct, conform, to_frame
 from romandask.runtime.units import Unit
-from romandask.statistics import Statistics, statistics
+from romandask.samples import limits, samples
+from romandask.statistics import SURVEYS, Samples, Statistics, statistics
 from romandask.truth import TruthCatalogs, truth
 from romandask.truth_index import truth_index
-from romandask.truth_match import truth_match, truth_summary
+from romandask.truth_match import reference_band, truth_match, truth_summary
 from romandask.zero_points import zero_points
 
 
@@ -171,19 +173,45 @@ class SurveyProducts:
         zero, tiles = self.zero_points_product(survey), self.coadd_product(survey)
         return self._once("objects", survey, lambda: objects(found, tiles, settings, self.region, zero))
 
+    def limit_product(self, survey: str) -> TableProduct:
+        """The faintest magnitude of a survey's sample."""
+        settings, bands = self.pipeline.matches, {reference_band(one): name for name, one in self.instruments.items()}
+        if unknown := set(settings.limits or {}) - set(bands):
+            raise UserError(f"matches.limits: {', '.join(sorted(unknown))}: they are those of {', '.join(bands)}")
+        band, matched = reference_band(self._instrument(survey)), self.truth_match_product(survey)
+        return self._once("limits", survey, lambda: limits(self.object_product(survey), matched, settings, band))
+
+    def sample_product(self, survey: str) -> TableProduct:
+        """The sample of a survey's objects."""
+        instrument, settings = self._instrument(survey), self.pipeline.matches
+        tables = self.object_product(survey), self.truth_match_product(survey), self.limit_product(survey)
+        bands = instrument.bands, reference_band(instrument)
+        return self._once("samples", survey, lambda: samples(*tables, settings, *bands))
+
     @property
     def match_products(self) -> Matches:
         """The stages of friends of friends."""
-        tables = {name: self.object_product(name) for name in self.instruments}
+        tables = {name: self.sample_product(name) for name in self.instruments}
         return self._once("matches", "all", lambda: matches(tables, self.pipeline.matches, self.region, self.store))
+
+    @property
+    def chance_products(self) -> Matches:
+        """The same of a sky in which one survey is moved."""
+        tables, settings = {name: self.sample_product(name) for name in self.instruments}, self.pipeline.matches
+        return self._once(
+            "chance", "all", lambda: matches(tables, settings, self.region, self.store, "chance", SHIFT)
+        )  # fmt: skip
 
     @property
     def statistic_products(self) -> Statistics:
         """The tables of the statistics stage."""
-        made = statistics(
-            self.match_products.groups, self.object_product("rubin"), self.pipeline.matches.linking_lengths
-        )
-        return Statistics(self._stored(made.blends), self._stored(made.unrecognised))
+        truth = self.truth_catalogs
+        known = Samples(
+            {name: self.sample_product(name) for name in SURVEYS},
+            {name: reference_band(self._instrument(name)) for name in SURVEYS}, truth.galaxies, truth.stars,
+        )  # fmt: skip
+        made = statistics(self.match_products, self.chance_products, known, self.pipeline.matches.linking_lengths)
+        return Statistics(*(self._stored(table) for table in vars(made).values()))
 
     def make_pointings(self, survey: str) -> pd.DataFrame:
         """Return the pointings made afresh, whatever the store has."""

@@ -20,10 +20,11 @@ from romandask.kernels.scene import Truth, bind
 from romandask.model.config import TruthSettings
 from romandask.model.sky import Region, cell_area, cells_in_cone, unit_vectors
 from romandask.model.spectra import Bandpass, SpectrumLibrary
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
-from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store, write_coordinate
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
 WIDE = 1e7
@@ -94,18 +95,8 @@ def _rows_near(
 ) -> pd.DataFrame:
     """Return the rows of the cells that touch a cone, sorted by their place: of columns all but those of fluxes."""
     order = max(product.order or 0, NEAR_ORDER)
-    cells = cells_in_cone(ra, dec, radius, order)
-    home = cells >> (2 * (order - (product.order or 0)))
-    shift = 2 * (29 - order)
     columns = wanted or [name for name in product.schema.names if not name.startswith(("flux_", "dust_", "lsst_flux_"))]
-    columns = list(dict.fromkeys([*columns, "_healpix_29"]))
-    parts = []
-    for index in product.touching(np.unique(home)):
-        own = cells[home == (product.pixels or ())[index]]
-        near = product.select(index, columns, (int(own[0]) << shift, (int(own[-1]) + 1) << shift))
-        parts.append(near[np.isin(near["_healpix_29"].to_numpy() >> shift, own)])
-    filled = [part for part in parts if len(part)]
-    return pd.concat(filled, ignore_index=True) if filled else product.empty()[columns]
+    return product.rows_in(cells_in_cone(ra, dec, radius, order), order, columns)
 
 
 def truth(

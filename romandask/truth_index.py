@@ -9,8 +9,9 @@ import pandas as pd
 
 from romandask.exposures import RenderExposure, View
 from romandask.kernels.scene import OFF_IMAGE
-from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import LazyUnits, Unit
 
 

@@ -15,8 +15,9 @@ from romandask.kernels.counterparts import counterparts
 from romandask.model.config import DetectionSettings
 from romandask.model.sky import unit_vectors
 from romandask.model.spectra import ab_magnitude
-from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
 BINS = np.arange(17.0, 30.01, 0.5)

@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 
 from romandask.model.spectra import ab_magnitude
-from romandask.runtime.products import ImageProduct, TableProduct
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.schemas import schema
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
 BRIGHT, FAINT = 17.0, 20.0

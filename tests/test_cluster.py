@@ -12,8 +12,8 @@ import pytest
 
 from romandask.runtime.cluster import ATTEMPTS, runner
 from romandask.runtime.order import Waiting
-from romandask.runtime.products import TableProduct
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.runtime.work import Task
 

@@ -9,11 +9,13 @@ import pytest
 import xarray as xr
 from astropy.wcs import WCS
 from drizzle.resample import Drizzle
+from scipy import ndimage
 
-from romandask.coadds import coadds
+from romandask.coadds import coadds, mark_saturated
 from romandask.exposures import RenderExposure, wcs_of
 from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman import Roman, RomanSettings
+from romandask.kernels.detector import SATURATED
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.pixel_map import pixel_map, strips
 from romandask.kernels.stack import stack
@@ -59,6 +61,36 @@ def test_the_map_of_few_rows_is_that_of_many(small, rows):
     whole = pixel_map(source, target, slice(0, 300), slice(0, 300)).dense()
     np.testing.assert_allclose(pixel_map(source, target, rows, slice(0, 300)).dense(), whole[rows], atol=1e-6)
     np.testing.assert_allclose(pixel_map(source, target, slice(0, 300), rows).dense(), whole[:, rows], atol=1e-6)
+
+
+def test_the_map_at_some_pixels_is_that_of_all(small):
+    source, (target, _) = WCS(small.roman.header(small.exposures[0])), target_of(small)
+    onto = pixel_map(source, target, slice(100, 300), slice(20, 280))
+    rows, columns = np.random.default_rng(2).integers((100, 20), (300, 280), (500, 2)).T
+    np.testing.assert_allclose(onto.at(rows, columns), onto.dense()[rows - 100, columns - 20], atol=1e-9)
+
+
+def test_tiles_are_marked_where_exposures_are_saturated(small):
+    """Everywhere that the light of a saturated pixel would have gone, and nowhere else."""
+    source, (target, shape) = WCS(small.roman.header(small.exposures[0])), target_of(small)
+    parts = strips(source, (300, 300), target, shape)
+    dq = np.zeros((300, 300), np.uint8)
+    rows, columns = np.random.default_rng(3).integers(0, 300, (2, 200))
+    dq[rows, columns] = SATURATED
+    dq[150, 150] = 2
+    marked = np.zeros(shape, np.uint8)
+    mark_saturated(marked, dq, parts, source, target)
+    sums = Sums(shape, 1, 0.7)
+    light = ((dq & SATURATED) > 0).astype(np.float32)
+    sums.add(
+        ([light[p.rows, p.columns]], light[p.rows, p.columns], pixel_map(source, target, p.rows, p.columns))
+        for p in parts
+    )  # fmt: skip
+    touched = sums.weight > 0
+    assert touched.sum() > 100
+    assert (marked[touched] == SATURATED).all()
+    near = ndimage.binary_dilation(touched, np.ones((3, 3)))
+    assert not marked[~near].any()
 
 
 def test_flux_is_conserved_through_distortion_and_roll(small):

@@ -6,18 +6,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from romandask.kernels.groups import label, links
-from romandask.matches import Matches, length_name, matches
+from romandask.kernels.groups import forest, label, links
+from romandask.matches import SHIFT, Matches, group_of, length_name, matches
 from romandask.model.config import MatchSettings
 from romandask.model.errors import UserError
 from romandask.model.sky import ARCSEC, Region, unit_vectors
 from romandask.runtime.cluster import InProcess
 from romandask.runtime.hats import with_spatial_index
-from romandask.runtime.products import TableProduct, Unit
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
+from romandask.runtime.units import Unit
 from romandask.runtime.work import Task
-from romandask.statistics import group_counts, matrix, statistics
 
 REGION = Region(359.99, 0.01, -0.01, 0.01)
 
@@ -48,9 +48,15 @@ def test_groups_equal_brute_force(seed, count):
     random = np.random.default_rng(seed)
     vectors = unit_vectors(random.uniform(0, 6, count) / 3600, 70 + random.uniform(0, 6, count) / 3600)
     pairs, gap = links(vectors, 1.0)
-    found = label(np.arange(count), pairs)
-    assert as_sets(found) == {frozenset(group) for group in brute_force(vectors, 1.0)}
     assert (gap <= 1.0 + 1e-9).all()
+    assert len({frozenset(pair) for pair in pairs.tolist()}) == len(pairs), "no pair twice"
+    into, joined = forest(count, pairs, gap)
+    assert (into <= np.arange(count)).all()
+    # the one forest has the groups of every shorter length
+    for length in (1.0, 0.6, 0.25):
+        found = label(into, joined, length)
+        assert as_sets(found) == {frozenset(group) for group in brute_force(vectors, length)}
+        assert (found <= np.arange(count)).all(), "a group is named after its first row"
 
 
 def test_a_link_is_an_angle_not_a_difference_of_coordinates():
@@ -78,10 +84,10 @@ def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
     )
 
 
-def stored_matches(products, settings: MatchSettings, folder) -> Matches:
+def stored_matches(products, settings: MatchSettings, folder, kind: str = "matches", shift: float = 0.0) -> Matches:
     """Groups made stage by stage, each reading the stored one before."""
     store = Store(folder)
-    made = matches(products, settings, REGION, store)
+    made = matches(products, settings, REGION, store, kind, shift)
     for product in (made.local, made.crossing, made.merged, made.groups):
         tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
         assert all(outcome.record for outcome in InProcess().run(product, tasks, store))
@@ -125,24 +131,27 @@ def test_groups_do_not_depend_on_partitions(clumped, object_order, match_order, 
         assert as_sets(found[column]) == {frozenset(group) for group in brute_force(vectors, length)}
         smallest = found.groupby(column)["key"].min()
         assert (smallest.index == smallest).all(), "a group is named after its smallest key"
+    for length in (0.8, 0.3):
+        parts = [made.groups.load(k) for k in range(len(made.groups.units))]
+        group = np.concatenate([group_of(part, made.merged.load(0), length) for part in parts])
+        assert as_sets(group) == {frozenset(group) for group in brute_force(vectors, length)}
 
 
-def test_the_blend_matrix_counts_every_object_once(clumped, tmp_path):
+def test_a_moved_survey_keeps_its_own_groups_and_loses_those_with_the_other(clumped, tmp_path):
+    """Moved by more than a clump is wide, pairs are those of the moved positions: brute force says which."""
     roman, rubin = clumped
-    products = {"roman": table("roman", roman, 12), "rubin": table("rubin", rubin, 12)}
-    made = stored_matches(products, MatchSettings(order=12), tmp_path)
-    counted = statistics(made.groups, products["rubin"], (1.0, 0.5))
-    for length in (1.0, 0.5):
-        counts = matrix(counted.blends.all_rows(), length)
-        assert (counts.sum(axis=1) * counts.index).sum() == 500
-        assert (counts.sum(axis=0) * counts.columns).sum() == 260
-        groups = group_counts(made.groups, length)
-        blends = ((groups["roman"] >= 2) & (groups["rubin"] == 1)).sum()
-        unrecognised = counted.unrecognised.all_rows()
-        chosen = unrecognised[np.isclose(unrecognised["linking_length"], length)]
-        assert chosen["blends"].sum() == blends
-        # all objects of this table have one magnitude
-        assert (chosen["rubin_objects"] > 0).sum() == 1
+    products = {"roman": table("roman", roman, 11), "rubin": table("rubin", rubin, 11)}
+    made = stored_matches(products, MatchSettings(order=12), tmp_path, "chance", SHIFT)
+    found = made.groups.all_rows()
+    dec = np.concatenate(
+        [roman["coord_dec"], rubin["coord_dec"] - np.where(rubin["coord_dec"] > 0, 1, -1) * SHIFT / 3600]
+    )
+    key = np.concatenate([roman["objectId"] * 8, rubin["objectId"] * 8 + 1])
+    vectors = unit_vectors(np.concatenate([roman["coord_ra"], rubin["coord_ra"]]), dec)
+    order = np.argsort(key)
+    expected = {frozenset(key[order][list(group)]) for group in brute_force(vectors[order], 1.0)}
+    groups = found.groupby("group_1000mas")["key"].agg(frozenset)
+    assert set(groups) == expected
 
 
 def test_no_objects_are_no_groups(tmp_path):
@@ -150,10 +159,9 @@ def test_no_objects_are_no_groups(tmp_path):
     products = {"roman": table("roman", empty, 10), "rubin": table("rubin", empty, 10)}
     made = stored_matches(products, MatchSettings(order=10), tmp_path)
     assert len(made.groups.all_rows()) == 0
-    assert len(statistics(made.groups, products["rubin"], (1.0,)).blends.all_rows()) == 0
 
 
-def test_links_longer_than_a_cell_are_refused():
+def test_links_longer_than_what_is_looked_at_around_a_partition_are_refused():
     products = {"roman": table("roman", pd.DataFrame({"objectId": [1], "coord_ra": [0.0], "coord_dec": [0.0]}), 10)}
-    with pytest.raises(UserError, match=r"matches\.order"):
+    with pytest.raises(UserError, match=r"linking_lengths: 60 arcsec, 5 at most"):
         matches(products, MatchSettings(linking_lengths=(60.0,), order=12), REGION)

@@ -19,7 +19,7 @@ LAYERS = [
     {"survey_products"},
     {"pipeline", "statistics"},
     {"truth_match"},
-    {"matches", "detections", "cutouts", "effects", "star", "pixfrac"},
+    {"matches", "samples", "detections", "cutouts", "effects", "star", "pixfrac"},
     {"coadds", "tile_layers", "zero_points", "validation"},
     {"coadd_psfs"},
     {"truth_index", "psfs"},

@@ -159,12 +159,27 @@ def test_noise_realisations_have_the_noise_of_the_images(survey):
 
 def test_groups_hold_every_object_and_the_matrix_counts_them(survey):
     groups = survey.matches().compute()
-    counts = {name: len(survey.objects(name)) for name in ("roman", "rubin")}
+    samples = {name: survey.sample(name).compute() for name in ("roman", "rubin")}
+    counts = {name: len(frame) for name, frame in samples.items()}
+    for name, band, limit in (("roman", "H158", 25.42), ("rubin", "i", 25.63)):
+        objects = survey.objects(name).compute().set_index("objectId").loc[samples[name]["objectId"]]
+        magnitude = 31.4 - 2.5 * np.log10(objects[f"{band}_kronFlux"]) - objects[f"{band}_extinction"]
+        assert magnitude.max() <= limit
+        assert ((objects["flags"] & ~1) == 0).all()
+        assert 20 < len(objects) < len(survey.objects(name))
     assert groups["survey"].value_counts().to_dict() == counts
     for length in (1.0, 0.5):
         matrix = survey.statistics.blends(length)
         assert (matrix.sum(axis=1) * matrix.index).sum() == counts["roman"]
         assert (matrix.sum(axis=0) * matrix.columns).sum() == counts["rubin"]
+    shorter = survey.matches(0.7).compute()
+    tree = cKDTree(unit_vectors(groups["coord_ra"], groups["coord_dec"]))
+    near = sum(len(found) - 1 for found in tree.query_ball_point(tree.data, 0.7 * ARCSEC)) // 2
+    assert len(groups) - near <= shorter["group"].nunique() <= len(groups)
+    assert shorter["group"].nunique() >= groups["group_1000mas"].nunique()
+    for wrong in (3.0, 0.0):
+        with pytest.raises(rd.UserError, match="linking length"):
+            survey.matches(wrong)
     with pytest.raises(rd.UserError, match="linking length"):
         survey.statistics.blends(3.0)
     with pytest.raises(rd.UserError, match="roman, rubin"):

@@ -13,7 +13,7 @@ from romandask.kernels.layer import TRIALS, Layer, at
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
 """Kron aperture: this many Kron radii, and at least this many semi-axes (PHOT_AUTOPARAMS of Source Extractor)."""
-NOT_DEBLENDED, NO_DATA = 256, 512
+NOT_DEBLENDED, NO_DATA, SATURATED_CORE = 256, 512, 1024
 FLAGS = {
     "deblended": sep.OBJ_MERGED,
     "truncated": sep.OBJ_TRUNC,
@@ -25,6 +25,7 @@ FLAGS = {
     "kron_nonpositive": sep.APER_NONPOSITIVE,
     "not_deblended": NOT_DEBLENDED,
     "no_data": NO_DATA,
+    "saturated": SATURATED_CORE,
 }
 """Bits of the flags column: sep's own, then ours."""
 PSF_RADIUS = 12

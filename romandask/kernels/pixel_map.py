@@ -55,6 +55,14 @@ class PixelMap:
         along = CubicSpline(self.y, self.places, axis=1)(rows)
         return np.ascontiguousarray(np.moveaxis(CubicSpline(self.x, along, axis=2).c, (0, 1, 2, 3), (3, 2, 1, 0)))
 
+    def at(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the places (k, 2) of some pixels (k,)."""
+        unique, row = np.unique(rows, return_inverse=True)
+        piece = np.clip(np.searchsorted(self.x, columns, "right") - 1, 0, len(self.x) - 2)
+        curve = self.curves(unique)[row, :, piece]
+        step = (columns - self.x[piece])[:, None]
+        return ((curve[..., 0] * step + curve[..., 1]) * step + curve[..., 2]) * step + curve[..., 3]
+
     def dense(self) -> np.ndarray:
         """Return the places of all pixels, (ny, nx, 2)."""
         columns = np.arange(self.columns.start, self.columns.stop)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import galsim
 import numpy as np
@@ -96,6 +96,9 @@ class PsfModel:
     """Of the polynomials in place; 0 for a PSF that is the same everywhere."""
     shape: tuple[int, int] = (1, 1)
     """Detector (ny, nx)."""
+    # of each size of stamps once; they go with the model, as a cache of the class would not
+    _known: dict[int, Frequencies] = field(default_factory=dict, repr=False)
+    _known_wide: dict[int, Frequencies] = field(default_factory=dict, repr=False)
 
     def weights(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the modes' weights (n, modes), float32, of light (n, nodes) at places on the detector."""
@@ -110,14 +113,19 @@ class PsfModel:
         """Return, as `weights`, only what the PSF at places differs by from that in the middle."""
         return self.weights(photons, x, y) - (photons @ self.mixing[: photons.shape[1]]).astype(np.float32)
 
-    @lru_cache(maxsize=16)  # noqa: B019 - a model lives as long as its detector is drawn
     def frequencies(self, stamp: int) -> Frequencies:
         """Return the modes at the frequencies of a stamp of at most core.size pixels."""
-        return stamp_frequencies(self.modes, self._images, self.core, stamp)
+        if stamp not in self._known:
+            self._known[stamp] = stamp_frequencies(self.modes, self._images, self.core, stamp)
+        return self._known[stamp]
 
-    @lru_cache(maxsize=4)  # noqa: B019
     def wide_frequencies(self, stamp: int) -> Frequencies:
         """Return the PSFs of the nodes in the middle of the detector at the frequencies of a larger stamp."""
+        if stamp not in self._known_wide:
+            self._known_wide[stamp] = self._wide(stamp)
+        return self._known_wide[stamp]
+
+    def _wide(self, stamp: int) -> Frequencies:
         fine = np.empty((len(self.nodes), 0, 0), np.float32)
         # a stamp as large as the grid needs no image to cut
         if stamp < self.grid.size:

@@ -138,9 +138,15 @@ class DetectionSettings(Section):
 
 
 class MatchSettings(Section):
-    """Friends of friends over all object tables."""
+    """Friends of friends over the samples of all surveys."""
 
     linking_lengths: tuple[float, ...] = Field((1.0, 0.5), min_length=1, description="arcsec")
+    sample: Literal["clean", "all"] = Field(
+        "clean", description="clean: unflagged objects with a true counterpart, to the limits; all: every object"
+    )
+    limits: dict[str, float] | None = Field(
+        None, description="faintest magnitude by reference band (H158, i); where counts fall to 80% if not given"
+    )
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
 
 

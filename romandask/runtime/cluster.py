@@ -21,10 +21,11 @@ import dask
 from distributed import Client, LocalCluster
 
 from romandask.model.errors import UserError
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record
 from romandask.runtime.order import Waiting
-from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.work import Task, make_unit
 
 ATTEMPTS = 3

@@ -15,14 +15,16 @@ from hats.catalog.dataset.collection_properties import CollectionProperties
 from hats.pixel_math.spatial_index import SPATIAL_INDEX_COLUMN, compute_spatial_index
 
 from romandask.runtime.manifest import read_record
-from romandask.runtime.products import TableProduct
 from romandask.runtime.store import MARGIN, Store, write_bytes
+from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import LazyUnits, Unit
 
 WIDTH = 10.0
 """Rows this near to a partition, arcsec, are in its margin: further than any linking length in use."""
 RIM_ORDER = 13
 """HEALPix order of the cells around a partition that make its margin: 26 arcsec wide, 18 where they are flattest."""
+RIM = 18.0
+"""So far, arcsec, a margin reaches anywhere."""
 
 
 def with_spatial_index(frame: pd.DataFrame, ra: str = "ra", dec: str = "dec") -> pd.DataFrame:
@@ -36,8 +38,8 @@ def with_spatial_index(frame: pd.DataFrame, ra: str = "ra", dec: str = "dec") ->
 def margin(product: TableProduct) -> TableProduct:
     """Return the margin of a catalog: for each partition the rows of others around it, within WIDTH at least."""
     order, pixels = product.order or 0, np.array(product.pixels or (), np.int64)
-    rims = [_rim(pixel, order) for pixel in pixels.tolist()]
-    around = [product.touching(np.unique(rim >> (2 * (RIM_ORDER - order)))) for rim in rims]
+    rims = [rim(pixel, order) for pixel in pixels.tolist()]
+    around = [product.touching_cells(cells, RIM_ORDER) for cells in rims]
 
     def unit(index: int) -> Unit:
         inputs = tuple((product.stage, product.names[k]) for k in around[index])
@@ -46,7 +48,7 @@ def margin(product: TableProduct) -> TableProduct:
     return TableProduct(
         product.stage + MARGIN,
         LazyUnits(product.names, unit),
-        _MakeMargin(product, tuple(map(tuple, around)), order),
+        _MakeMargin(product, order),
         product.schema,
         product.pixels,
         product.order,
@@ -59,28 +61,24 @@ def margin(product: TableProduct) -> TableProduct:
 @dataclass(frozen=True)
 class _MakeMargin:
     product: TableProduct
-    around: tuple[tuple[int, ...], ...]
     order: int
 
     def __call__(self, index: int) -> pd.DataFrame:
-        rim = _rim((self.product.pixels or ())[index], self.order)
-        shift = 2 * (29 - RIM_ORDER)
-        parts = []
-        for k in self.around[index]:
-            own = rim[rim >> (2 * (RIM_ORDER - self.order)) == (self.product.pixels or ())[k]]
-            near = self.product.select(k, None, (int(own.min()) << shift, (int(own.max()) + 1) << shift))
-            parts.append(near[np.isin(near[SPATIAL_INDEX_COLUMN].to_numpy() >> shift, own)])
-        filled = [part for part in parts if len(part)]
-        if not filled:
-            return self.product.empty()
-        return pd.concat(filled).sort_values(SPATIAL_INDEX_COLUMN, kind="stable", ignore_index=True)
+        found = self.product.rows_in(rim((self.product.pixels or ())[index], self.order), RIM_ORDER)
+        return found.sort_values(SPATIAL_INDEX_COLUMN, kind="stable", ignore_index=True)
 
 
-def _rim(pixel: int, order: int) -> np.ndarray:
+def rim(pixel: int, order: int) -> np.ndarray:
     """Return the cells of RIM_ORDER that lie along the outside of a cell, corners included."""
     edges, corners = healpix.external_neighbours(np.array([pixel], np.uint64), order, RIM_ORDER - order)
     found = np.concatenate([np.ravel(edges), np.ravel(corners)]).astype(np.int64)
     return np.unique(found[found >= 0])
+
+
+def inner_rim(pixel: int, order: int) -> np.ndarray:
+    """Return the cells of RIM_ORDER that lie along the inside of a cell."""
+    around = np.unique(healpix.neighbours(rim(pixel, order).astype(np.uint64), RIM_ORDER).astype(np.int64))
+    return around[around >> 2 * (RIM_ORDER - order) == pixel]
 
 
 def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec: str = "dec") -> None:

@@ -62,3 +62,13 @@ def _not_here(index: int) -> Unit:
 def names_of(units: Sequence[Unit]) -> tuple[str, ...]:
     """Return the names of units."""
     return units.names if isinstance(units, LazyUnits) else tuple(unit.name for unit in units)
+
+
+@dataclass(frozen=True)
+class Made:
+    """What storing one unit wrote."""
+
+    output: str
+    """Hash of the content."""
+    bytes: int
+    rows: int

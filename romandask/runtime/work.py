@@ -7,10 +7,11 @@ import time
 import warnings
 from dataclasses import dataclass
 
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record, write_record
 from romandask.runtime.memory import give_back
-from romandask.runtime.products import ImageProduct, TableProduct
 from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
 
 
 @dataclass(frozen=True)

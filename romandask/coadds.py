@@ -104,11 +104,11 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
-        bytes_per_unit=pixels**2 * ((45 if drawn else 4) + 4 * planes)
-        + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 40_000))
-        + (300 << 20 if drawn else 150 << 20),
+        bytes_per_unit=pixels**2 * ((45 if drawn else 3) + 4 * planes)
+        + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 25_000))
+        + (300 << 20 if drawn else 50 << 20),
         # a drizzled exposure seldom covers a whole tile
-        seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 6e-8 * float(mean)),
+        seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 2.5e-8 * float(mean)),
         tables={"sets": schema("sets")},
     )
 

@@ -74,7 +74,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # three planes, a mask and some chunks of all bands; after that a band's two planes and the map of objects
         bytes_per_unit=pixels**2 * 13 + (330 << 20),
-        seconds_per_unit=pixels**2 * 1.2e-6,
+        seconds_per_unit=pixels**2 * 7e-7,
         tables={"objects": schema("objects", bands)},
     )
 

@@ -31,7 +31,7 @@ def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableP
     units = _units(detections, detections.stage, state)
     return TableProduct(
         f"truth_match/{render.instrument.name}", units, MatchTile(detections, settings), schema("truth_match"),
-        bytes_per_unit=600 << 20, seconds_per_unit=5.0,
+        bytes_per_unit=600 << 20, seconds_per_unit=0.5,
     )  # fmt: skip
 
 
@@ -42,7 +42,7 @@ def truth_summary(matched: TableProduct, detections: ImageProduct, settings: Det
     units = _units(detections, matched.stage, {"faintest": settings.summary_magnitude, "bands": bands})
     return TableProduct(
         f"truth_summary/{render.instrument.name}", units, SummariseTile(matched, detections, settings),
-        schema("truth_summary", bands), bytes_per_unit=600 << 20, seconds_per_unit=5.0,
+        schema("truth_summary", bands), bytes_per_unit=600 << 20, seconds_per_unit=0.5,
     )  # fmt: skip
 
 

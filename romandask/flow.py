@@ -128,11 +128,12 @@ def stages(survey: Survey) -> list[Stage]:
         ]
     for name in names:
         found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
+    for name in names:
+        found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
+        sample = f"samples/{name}"
+        found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
+    found += [Stage(f"shear/{name}", lambda s, name=name: s.shear_product(name)) for name in names]
     if {"roman", "rubin"} <= set(names):
-        for name in names:
-            found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
-            sample = f"samples/{name}"
-            found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
         for kind, products in (("matches", "match_products"), ("chance", "chance_products")):
             found += [
                 Stage(f"{kind}/{part}", lambda s, products=products, part=part: getattr(getattr(s, products), part))
@@ -342,6 +343,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
                 "objects",
                 "limits",
                 "samples",
+                "shear",
                 "matches",
                 "chance",
                 "statistics",

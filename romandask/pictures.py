@@ -315,6 +315,24 @@ def blend_distributions(table: pd.DataFrame) -> bytes:
     return _png(figure)
 
 
+def shear(tables: dict[str, pd.DataFrame]) -> bytes:
+    """Return xi+ and xi- against separation with theory, by survey (catalogs/shear.yaml)."""
+    figure = _figure(10, 3.8)
+    for position, kind in enumerate(("xip", "xim")):
+        axes = figure.add_subplot(1, 2, position + 1)
+        for number, (survey, table) in enumerate(tables.items()):
+            place = table["separation"] * (1 + 0.04 * number)
+            style = {"fmt": "o", "ms": 3, "color": f"C{number}", "label": survey}
+            axes.errorbar(place, place * table[kind] * 1e4, place * table[f"{kind}_error"] * 1e4, **style)
+            axes.plot(place, table["separation"] * table[f"{kind}_theory"] * 1e4, color=f"C{number}", lw=0.9)
+        axes.axhline(0, color="0.8", lw=0.8)
+        axes.set_xscale("log")
+        axes.set_xlabel("arcmin")
+        axes.set_ylabel(f"separation $\\xi_{'+' if kind == 'xip' else '-'}$, $10^{{-4}}$ arcmin")
+        axes.legend(fontsize=8)
+    return _png(figure)
+
+
 def _in_sigma(plane: np.ndarray) -> np.ndarray:
     """Return an image in units of its own noise (median absolute deviation)."""
     sigma = 1.4826 * np.median(np.abs(plane - np.median(plane)))

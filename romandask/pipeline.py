@@ -15,6 +15,7 @@ from romandask.instruments.rubin import Rubin, RubinSettings
 from romandask.model.config import (
     CoaddSettings,
     DetectionSettings,
+    LensingSettings,
     MatchSettings,
     RegionSettings,
     RenderSettings,
@@ -44,6 +45,7 @@ class Pipeline(Section):
     coadds: CoaddSettings = CoaddSettings()
     detections: DetectionSettings = DetectionSettings()
     matches: MatchSettings = MatchSettings()
+    lensing: LensingSettings = LensingSettings()
     run: RunSettings = RunSettings()
 
     def instruments(self) -> dict[str, Instrument]:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from romandask import pictures
 from romandask.effects import differences
 from romandask.flow import Planned, run_figures, stored_versions
+from romandask.lensing import significance
 from romandask.model.spectra import ab_magnitude
 from romandask.pointings import corners_of
 from romandask.readout import before
@@ -57,6 +58,7 @@ def write_report(survey: Survey) -> Path:
         _detector(survey),
         _measurements(survey, objects),
         _blends(survey),
+        _lensing(survey),
         _figures_of_the_run(survey),
     ]
     title = html.escape(f"romandask: {survey.pipeline.name}")
@@ -315,6 +317,31 @@ def _blend_row(survey: Survey, length: float, table: pd.DataFrame, chance: pd.Da
         "one or more by chance": share(moved["with_roman"], moved["rubin_objects"]),
         "two or more by chance": share(moved["blends"], moved["rubin_objects"]),
     }
+
+
+def _lensing(survey: Survey) -> str:
+    tables = {name: survey.shear(name) for name in survey.instruments}
+    tables = {name: table for name, table in tables.items() if len(table)}
+    if not tables:
+        return ""
+    rows = [
+        {
+            "survey": name, "galaxies": f"{table['galaxies'].iloc[0]:,}",
+            "galaxies / arcmin2": f"{table['galaxies'].iloc[0] / survey.region.area:.1f}",
+            "rms of a component": f"{table['sigma'].iloc[0]:.3f}", "signal to noise": f"{significance(table):.1f}",
+        }
+        for name, table in tables.items()
+    ]  # fmt: skip
+    return (
+        "<h2>Cosmic shear</h2>"
+        + _table(pd.DataFrame(rows))
+        + "<p>Troxel et al. (2023), the whole survey: 69 galaxies a square arcminute, 0.247, signal to noise 47.</p>"
+        + _image(
+            pictures.shear(tables),
+            "Two-point functions of the true shapes of detected galaxies, with the errors of the Gaussian covariance; "
+            "lines: what the input cosmology makes of the sample's redshifts.",
+        )
+    )
 
 
 def _figures_of_the_run(survey: Survey) -> str:

@@ -169,6 +169,14 @@ class Survey(SurveyProducts):
         """Return the lazy sample of a survey's objects that the groups are made of (schema: catalogs/samples.yaml)."""
         return self.sample_product(survey).frame
 
+    def shear(self, survey: str) -> pd.DataFrame:
+        """Return xi+ and xi- of the true shapes of a survey's sample (schema: catalogs/shear.yaml).
+
+        Of a region too small for the shortest separation it has no rows. `romandask.lensing.significance` is the signal
+        to noise of such a table.
+        """
+        return self.shear_product(survey).all_rows()
+
     def matches(self, linking_length: float | None = None) -> dd.DataFrame:
         """Return the lazy friends-of-friends groups of the samples of all surveys (schema: catalogs/groups.yaml).
 

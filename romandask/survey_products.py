@@ -15,6 +15,7 @@ from romandask.detections import detections, objects
 from romandask.exposures import exposures
 from romandask.incoming import incoming, open_sources
 from romandask.instruments.exposure import Instrument
+from romandask.lensing import shear
 from romandask.matches import SHIFT, Matches, matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
@@ -187,6 +188,12 @@ class SurveyProducts:
         tables = self.object_product(survey), self.truth_match_product(survey), self.limit_product(survey)
         bands = instrument.bands, reference_band(instrument)
         return self._once("samples", survey, lambda: samples(*tables, settings, *bands))
+
+    def shear_product(self, survey: str) -> TableProduct:
+        """The two-point functions of the shapes of a survey's sample."""
+        sample, settings = self.sample_product(survey), self.pipeline
+        galaxies, lensing = self.truth_catalogs.galaxies, settings.lensing
+        return self._once("shear", survey, lambda: shear(sample, galaxies, lensing, self.region, settings.seed))
 
     @property
     def match_products(self) -> Matches:

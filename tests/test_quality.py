@@ -20,7 +20,7 @@ LAYERS = [
     {"pipeline", "statistics"},
     {"truth_match"},
     {"matches", "samples", "detections", "cutouts", "effects", "star", "pixfrac"},
-    {"coadds", "tile_layers", "zero_points", "validation"},
+    {"coadds", "tile_layers", "zero_points", "validation", "lensing"},
     {"coadd_psfs"},
     {"truth_index", "psfs"},
     {"exposures"},

@@ -22,7 +22,7 @@ THICKNESS = 200.0
 """Of a shell, comoving Mpc."""
 MIN_REDSHIFT = 0.01
 LENSED = ("delta", "galaxies", "convergence", "shear_1", "shear_2")
-_KMAX = 30.0
+K_MAX = 30.0
 """1/Mpc"""
 
 
@@ -116,9 +116,9 @@ def shell_spectra(lmax: int, cosmology: Cosmology = Cosmology()) -> np.ndarray: 
         window = 3 * chi**2 / (high**3 - low**3)
         wave = (sparse[:, None] + 0.5) / chi
         z = cosmology.inv_comoving_distance(chi)
-        p = np.stack([power.P(zi, np.minimum(wave[:, k], _KMAX)) for k, zi in enumerate(z)], 1)
+        p = np.stack([power.P(zi, np.minimum(wave[:, k], K_MAX)) for k, zi in enumerate(z)], 1)
         # beyond the last wave number of the table the non-linear spectrum falls as k^-2.5
-        p *= np.where(wave > _KMAX, (wave / _KMAX) ** -2.5, 1.0)
+        p *= np.where(wave > K_MAX, (wave / K_MAX) ** -2.5, 1.0)
         values = (p * (window**2 / chi**2 * shares * (high - low) / 2)).sum(axis=1)
         out[shell, 1:] = np.exp(np.interp(np.log(ell[1:]), np.log(sparse), np.log(values)))
     return out
@@ -145,7 +145,7 @@ def matter_power(cosmology: Cosmology = Cosmology()):  # noqa: B008
 
     first = results(2e-9, np.array([0.0]), 5.0).get_sigma8_0()
     amplitude = 2e-9 * (cosmology.sigma_8 / first) ** 2
-    found = results(amplitude, np.linspace(0, MAX_REDSHIFT + 0.1, 32), _KMAX * 1.01)
+    found = results(amplitude, np.linspace(0, MAX_REDSHIFT + 0.1, 32), K_MAX * 1.01)
     return found.get_matter_power_interpolator(nonlinear=True, hubble_units=False, k_hunit=False)
 
 

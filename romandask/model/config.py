@@ -150,6 +150,21 @@ class MatchSettings(Section):
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
 
 
+class LensingSettings(Section):
+    """Two-point functions of shear (Troxel et al. 2023, section 6.2)."""
+
+    min_separation: float = Field(2.5, gt=0, description="arcmin")
+    max_separation: float = Field(250.0, gt=0, description="arcmin; of a smaller region half its side")
+    bins: int = Field(20, ge=1, le=100, description="logarithmic, between the two")
+    patches: int = Field(40, ge=2, le=1000, description="of the sky, for the jackknife")
+
+    @model_validator(mode="after")
+    def _has_order(self) -> LensingSettings:
+        if self.max_separation <= self.min_separation:
+            raise ValueError(f"max_separation ({self.max_separation:g}) is not beyond min_separation")
+        return self
+
+
 class RunSettings(Section):
     """The local cluster."""
 

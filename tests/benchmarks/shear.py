@@ -5,6 +5,7 @@ python tests/benchmarks/shear.py [side in degrees: the whole footprint without]
 The sample is as dense as the paper's, 69 galaxies a square arcminute: the brightest in H158.
 """
 
+import resource
 import sys
 import time
 from pathlib import Path
@@ -45,7 +46,8 @@ def main(side: float | None) -> None:
     )
     start = time.perf_counter()
     table = two_point(frame, LensingSettings(), region, SEED)
-    print(f"two-point functions, jackknife and covariance: {time.perf_counter() - start:.0f} s on one core")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"xi, jackknife and covariance: {time.perf_counter() - start:.0f} s on one core, peak {peak:.2f} GiB")
     columns = ["separation", "xip", "xip_theory", "xip_error", "xip_jackknife", "xim", "xim_theory", "xim_error"]
     print(table[columns].to_string(float_format=lambda value: f"{value:.3g}"))
     for kind in ("xip", "xim"):

@@ -165,8 +165,8 @@ class SurveyProducts:
     def zero_points_product(self, survey: str) -> TableProduct:
         """The offsets of an instrument's magnitudes, from its stars."""
         bands = self._instrument(survey).bands
-        tables = self.truth_summary_product(survey), self.truth_match_product(survey)
-        return self._once("zero_points", survey, lambda: zero_points(*tables, self.detection_product(survey), bands))
+        summary, found = self.truth_summary_product(survey), self.detection_product(survey)
+        return self._once("zero_points", survey, lambda: zero_points(summary, found, bands))
 
     def object_product(self, survey: str) -> TableProduct:
         """The object table."""

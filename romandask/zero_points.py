@@ -18,18 +18,17 @@ BRIGHT, FAINT = 17.0, 20.0
 FLUXES = ("kronFlux", "apFlux", "psfFlux")
 
 
-def zero_points(
-    summary: TableProduct, matched: TableProduct, detections: ImageProduct, bands: tuple[str, ...]
-) -> TableProduct:
+def zero_points(summary: TableProduct, detections: ImageProduct, bands: tuple[str, ...]) -> TableProduct:
     """Return the lazy offsets of a survey's magnitudes (schema: catalogs/zero_points.yaml): one unit, of all tiles.
 
-    A tile that could not be made is left out.
+    Stars that are one object without a flag count: saturated and blended ones do not. A tile that could not be made is
+    left out.
     """
-    sources = tuple((product.stage, name) for product in (summary, matched, detections) for name in product.names)
+    sources = tuple((product.stage, name) for product in (summary, detections) for name in product.names)
     name = detections.stage.split("/")[1]
     return TableProduct(
         f"zero_points/{name}", (Unit("all", {"bands": bands, "limits": [BRIGHT, FAINT]}, optional=sources),),
-        MakeZeroPoints(summary, matched, detections, bands), schema("zero_points"), bytes_per_unit=400 << 20,
+        MakeZeroPoints(summary, detections, bands), schema("zero_points"), bytes_per_unit=400 << 20,
     )  # fmt: skip
 
 
@@ -70,7 +69,6 @@ class MakeZeroPoints:
     """Makes the offsets of a survey."""
 
     summary: TableProduct
-    matched: TableProduct
     detections: ImageProduct
     bands: tuple[str, ...]
 
@@ -81,13 +79,11 @@ class MakeZeroPoints:
         parts = [pd.DataFrame(columns=[*true, *measured], dtype=float)]
         stored = self.detections.store is not None
         for k in range(len(self.detections.units)):
-            if stored and not (self.detections.has(k) and self.summary.has(k) and self.matched.has(k)):
+            if stored and not (self.detections.has(k) and self.summary.has(k)):
                 continue
             summary = self.summary.load(k)
             summary = summary[summary["star"] & (summary["objects"] == 1)]
-            matched = self.matched.load(k)
-            alone = matched.loc[matched["candidates"] == 1, "objectId"]
             objects = self.detections.load(k, ("objects",))["objects"]
-            objects = objects[(objects["flags"] == 0) & objects["objectId"].isin(alone)]
+            objects = objects[objects["flags"] == 0]
             parts.append(summary[["objectId", *true]].merge(objects[["objectId", *measured]], on="objectId"))
         return offsets(pd.concat(parts, ignore_index=True), self.bands)

@@ -33,7 +33,7 @@ Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
 """By name: axes, values, attributes."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ImageProduct:
     """Images over units; `dataset` is the lazy xarray view."""
 
@@ -59,6 +59,10 @@ class ImageProduct:
     """Makes the arrays of one unit one after another, where all at once would not fit a worker."""
     tables: dict[str, pa.Schema] = field(default_factory=dict)
     """Tables that `make` returns beside the arrays of a unit, of any number of rows."""
+
+    def __repr__(self) -> str:
+        # what makes it holds the products that it reads, and those theirs
+        return f"ImageProduct({self.stage}, {len(self.units)} units)"
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from romandask.runtime.store import Store, read_parquet, write_parquet
 from romandask.runtime.units import Made, Unit, names_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TableProduct:
     """A table over units, HEALPix partitions or others; `frame` is the lazy dask DataFrame."""
 
@@ -32,6 +32,10 @@ class TableProduct:
     bytes_per_unit: int = 0
     seconds_per_unit: float = 0.0
     store: Store | None = None
+
+    def __repr__(self) -> str:
+        # what makes it holds the products that it reads, and those theirs
+        return f"TableProduct({self.stage}, {len(self.units)} units)"
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -109,7 +109,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         + (300 << 20 if drawn else 50 << 20),
         # a drizzled exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 2.5e-8 * float(mean)),
-        tables={"sets": schema("sets")},
+        tables={} if drawn else {"sets": schema("sets")},
     )
 
 
@@ -247,7 +247,7 @@ class DrawTile:
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
+        """Return image, weight, noise, nimages, dq and the PSF."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument: Any = source.instrument
         k, b = divmod(index, len(instrument.bands))
@@ -262,12 +262,7 @@ class DrawTile:
         corners = corners_of(source.table.iloc[self.members[k, band]])
         polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
         layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
-        chosen_names = [self.exposures.names[i] for i in self.members[k, band]]
-        exptimes = np.array([exposure.exptime for exposure in chosen])
-        made = {
-            "weight": layers.weight, "nimages": layers.count, "set": layers.set, "dq": np.zeros(shape, np.uint8),
-            "sets": sets_table(layers.set, layers.sets, exptimes, chosen_names),
-        }  # fmt: skip
+        made = {"weight": layers.weight, "nimages": layers.count, "dq": np.zeros(shape, np.uint8)}
         realisations = self.settings.noise
         if not layers.shares.any():
             side = psf_side(instrument)
@@ -383,12 +378,13 @@ def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Vari
             {"units": "s" if inputs else "1/nJy2", "long_name": "sum of weights"},
         ),
         Variable("noise", "float32", (noise, *shape), ("realisation", *axes), {"units": "nJy", "long_name": text}),
-        Variable("nimages", "uint8", shape, axes, {"long_name": "number of exposures"}),
+        Variable("nimages", "uint16", shape, axes, {"long_name": "number of exposures"}),
         Variable("dq", "uint8", shape, axes, {"long_name": "data quality", **flags}),
-        Variable("set", "uint16", shape, axes, {"long_name": "number of the set of exposures"}),
         Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star of flat f_nu, mean over the tile"}),
     ]  # fmt: skip
     if inputs:
+        # of the hundreds of visits that a drawn tile has there are more sets than can be numbered
+        found.append(Variable("set", "uint16", shape, axes, {"long_name": "number of the set of exposures"}))
         text = "unit star of flat f_nu of each exposure, as it is drizzled"
         found.append(Variable("input_psf", "float32", (inputs, psf, psf), ("input", "v", "u"), {"long_name": text}))
     return tuple(found)

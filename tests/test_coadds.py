@@ -226,6 +226,14 @@ def test_stack_counts_and_variances():
     assert layers.count.sum() == pytest.approx(2 * 21 * 21)
 
 
+def test_hundreds_of_exposures_are_counted():
+    """A deep field has more than a byte can count."""
+    square = np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]])
+    layers = stack(np.stack([square] * 300), np.ones(300), np.ones(300), (40, 40))
+    assert layers.count[20, 20] == 300
+    assert layers.weight[20, 20] == pytest.approx(300)
+
+
 @pytest.fixture(scope="module")
 def counted(small):
     maker = small.product.make

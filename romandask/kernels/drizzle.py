@@ -67,8 +67,8 @@ class Sums:
 
     @property
     def count(self) -> np.ndarray:
-        """Number of exposures that contribute to each pixel, (ny, nx) uint8."""
-        return np.array([min(len(members), 255) for members in self.sets], np.uint8)[self.set]
+        """Number of exposures that contribute to each pixel, (ny, nx) uint16."""
+        return np.array([len(members) for members in self.sets], np.uint16)[self.set]
 
     def means(self) -> list[np.ndarray]:
         """Return the weighted means of the planes, 0 where nothing falls.

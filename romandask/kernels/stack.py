@@ -6,23 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from romandask.kernels.drizzle import MOST_SETS
-
 
 @dataclass(frozen=True)
 class Stack:
     """Sums over the exposures that cover each pixel of a tile."""
 
     count: np.ndarray
-    """(ny, nx) uint8, exposures."""
+    """(ny, nx) uint16, exposures."""
     weight: np.ndarray
     """(ny, nx) float32, sum of inverse variances of an empty pixel, 1/flux^2."""
     source: np.ndarray
     """(ny, nx) float32: variance (flux^2) of the weighted mean for a unit flux of the objects."""
-    set: np.ndarray
-    """(ny, nx) uint16, number of the set of exposures; 0 for none."""
-    sets: list[tuple[int, ...]]
-    """Exposures of each set."""
     shares: np.ndarray
     """(exposures,) weight of each exposure, summed over the tile."""
 
@@ -36,10 +30,9 @@ def stack(polygons: np.ndarray, variances: np.ndarray, gains: np.ndarray, shape:
     variances : (n,) variance of an empty pixel, flux^2
     gains : (n,) electrons per unit flux, of each exposure
     """
-    count = np.zeros(shape, np.uint8)
+    count = np.zeros(shape, np.uint16)
     weight = np.zeros(shape, np.float32)
     source = np.zeros(shape, np.float32)
-    number, sets = np.zeros(shape, np.uint16), [()]
     shares = np.zeros(len(polygons))
     x, y = np.arange(shape[1]), np.arange(shape[0])[:, None]
     for k, (polygon, variance, gain) in enumerate(zip(polygons, variances, gains, strict=True)):
@@ -52,12 +45,5 @@ def stack(polygons: np.ndarray, variances: np.ndarray, gains: np.ndarray, shape:
         weight += inside * np.float32(1 / variance)
         source += inside * np.float32(1 / (variance**2 * gain))
         shares[k] = inside.sum() / variance
-        present = np.flatnonzero(np.bincount(number[inside]))
-        follow = np.zeros(len(sets), np.uint16)
-        follow[present] = len(sets) + np.arange(len(present))
-        number[inside] = follow[number[inside]]
-        sets += [(*sets[old], k) for old in present]
-        if len(sets) > MOST_SETS:
-            raise ValueError(f"more than {MOST_SETS} different sets of exposures on one tile: make tiles smaller")
     safe = np.where(weight > 0, weight, 1)
-    return Stack(count, weight, source / safe**2, number, sets, shares)
+    return Stack(count, weight, source / safe**2, shares)

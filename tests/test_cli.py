@@ -99,6 +99,6 @@ def test_the_papers_survey_is_planned_whole(tmp_path):
     assert units["detections/roman"] == pytest.approx(1039, rel=0.02)
     assert units["coadds/rubin"] == 6 * units["detections/rubin"]
     assert list(tmp_path.iterdir()) == []
-    done = command("plan", "troxel2023", "run.memory_limit=1.7", cwd=tmp_path)
+    done = command("plan", "troxel2023", "run.memory_limit=1.8", cwd=tmp_path)
     assert done.returncode == 2
     assert "lower coadds.pixels, or raise run.memory_limit" in done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -103,7 +104,8 @@ class ImageProduct:
             if name not in opened:
                 opened[name] = _array(group, name)
             index: Any = (*place, ..., *window)
-            with few_chunks():
+            # what is not compressed has no files in parts: its chunks are read as they are, ten at a time
+            with few_chunks() if opened[name].shards else nullcontext():
                 return np.asarray(opened[name][index])
 
         return read

@@ -20,7 +20,7 @@ from romandask.instruments.exposure import EXPOSURE_COLUMNS, Exposure, Instrumen
 from romandask.kernels.detector import SATURATED, noise_realisation, usable
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.fourier import POINT
-from romandask.kernels.pixel_map import PixelMap, Strip, pixel_map, strips
+from romandask.kernels.pixel_map import PixelMap, pixel_map, strips
 from romandask.kernels.psf import PsfModel
 from romandask.kernels.render import Scene, draw, draw_wide, plan_stamps
 from romandask.kernels.scene import build_scene
@@ -155,14 +155,14 @@ class DrizzleTile:
                 psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
         give_back()
         sums, dq = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac), np.zeros(shape, np.uint8)
-        for i, exposure, header, part in zip(members, exposures, headers, parts, strict=True):
+        for i, exposure, header, frame, part in zip(members, exposures, headers, frames, parts, strict=True):
             planes: Iterable = []
             if part:
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
-                mark_saturated(dq, arrays["dq"], part, WCS(header), target)
-                planes = _planes_of(
-                    arrays, part, instrument, exposure, header, target, source.seed, self.settings.noise
-                )
+                maps = [pixel_map(frame, target, strip.rows, strip.columns) for strip in part]
+                for onto in maps:
+                    mark_saturated(dq, arrays["dq"], onto)
+                planes = _planes_of(arrays, maps, instrument, exposure, header, source.seed, self.settings.noise)
             sums.add(planes)
         arrays, planes = {}, []
         give_back()
@@ -186,24 +186,25 @@ class DrizzleTile:
         }
 
 
-def mark_saturated(dq: np.ndarray, source: np.ndarray, parts: list[Strip], frame: WCS, target: WCS) -> None:
+def mark_saturated(dq: np.ndarray, source: np.ndarray, onto: PixelMap) -> None:
     """Set, in its place, the bit of a tile's dq plane (uint8) around where pixels of an exposure are saturated.
 
     They are left out of the mean, and what is left at a star's core is its fainter part.
+
+    Parameters
+    ----------
+    source : dq of the whole exposure
+    onto : the map of a part of it onto the tile
     """
-    for part in parts:
-        rows, columns = np.nonzero(source[part.rows, part.columns] & SATURATED)
-        if not len(rows):
-            continue
-        places = pixel_map(frame, target, part.rows, part.columns).at(
-            rows + part.rows.start, columns + part.columns.start
-        )
-        x, y = np.rint(places).astype(int).T
-        # a drop is less than two of the tile's pixels wide
-        for step_y, step_x in np.ndindex(3, 3):
-            v, u = y + step_y - 1, x + step_x - 1
-            inside = (v >= 0) & (u >= 0) & (v < dq.shape[0]) & (u < dq.shape[1])
-            dq[v[inside], u[inside]] |= SATURATED
+    rows, columns = np.nonzero(source[onto.rows, onto.columns] & SATURATED)
+    if not len(rows):
+        return
+    x, y = np.rint(onto.at(rows + onto.rows.start, columns + onto.columns.start)).astype(int).T
+    # a drop is less than two of the tile's pixels wide
+    for step_y, step_x in np.ndindex(3, 3):
+        v, u = y + step_y - 1, x + step_x - 1
+        inside = (v >= 0) & (u >= 0) & (v < dq.shape[0]) & (u < dq.shape[1])
+        dq[v[inside], u[inside]] |= SATURATED
 
 
 def most_inputs(members: dict[tuple[int, str], np.ndarray]) -> int:
@@ -297,24 +298,22 @@ def _number(realisation: int) -> tuple[int, ...]:
 
 def _planes_of(
     arrays: dict[str, np.ndarray],
-    parts: list[Strip],
+    maps: list[PixelMap],
     instrument: Instrument,
     exposure: Exposure,
     header: dict,
-    target: WCS,
     seed: int,
     realisations: int,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray, PixelMap]]:
-    """Yield, for each strip, image and noise realisations in nJy/arcsec2, weight and map onto the tile."""
+    """Yield, for each strip that has a map, image and noise realisations in nJy/arcsec2, weight and the map."""
     good = usable(arrays["dq"])
     # where the variance is worked out from the image it is needed once more
     image = arrays["image"].astype(np.float32) if "variance" in arrays else as_float(arrays.pop("image"))
     light = subtract_background(image, ~good)
     to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
     identity = ("noise", instrument.name, exposure.visit, exposure.detector)
-    wcs = WCS(header)
-    for part in parts:
-        here = (part.rows, part.columns)
+    for onto in maps:
+        here = (onto.rows, onto.columns)
         scale = to_njy / pixel_areas(header, instrument.shape, *here)
         background = instrument.background(exposure, header, *here)
         variance = empty_variance(arrays, background, instrument.detector, here)
@@ -326,7 +325,7 @@ def _planes_of(
             for number in range(realisations)
         ]  # fmt: skip
         weight = np.float32(exposure.exptime) * good[here]
-        yield [light[here] * scale, *(plane * scale for plane in noise)], weight, pixel_map(wcs, target, *here)
+        yield [light[here] * scale, *(plane * scale for plane in noise)], weight, onto
 
 
 def as_float(image: np.ndarray) -> np.ndarray:

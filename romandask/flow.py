@@ -332,23 +332,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
         folder = store.record(stage.name, "x").parent
         failed = len(list(folder.glob("*.failed")))
         done = len(store.records(stage.name))
-        known = not stage.name.startswith(
-            (
-                "calibration",
-                "exposures",
-                "truth_",
-                "zero_points",
-                "coadds",
-                "detections",
-                "objects",
-                "limits",
-                "samples",
-                "shear",
-                "matches",
-                "chance",
-                "statistics",
-            )
-        )
+        known = stage.name.startswith(("truth/", "pointings/"))
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
         else:

@@ -12,7 +12,7 @@ from romandask.kernels.shear import convergence_power, correlations, covariance,
 from romandask.model.config import LensingSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import Region
-from romandask.runtime.hats import RIM_ORDER, rim
+from romandask.runtime.hats import rows_around
 from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
@@ -63,8 +63,7 @@ class MeasureShear:
         ids = wanted.loc[~wanted["star"].to_numpy(bool) & (wanted["truth_id"] >= 0), "truth_id"].to_numpy()
         pixel, order = (self.sample.pixels or ())[index], self.sample.order or 0
         # a counterpart may lie beyond the border
-        places = [(np.array([pixel]), order), (rim(pixel, order), RIM_ORDER)]
-        rows = pd.concat([self.galaxies.rows_in(*place, SHAPE_COLUMNS) for place in places])
+        rows = rows_around(self.galaxies, pixel, order, SHAPE_COLUMNS)
         rows = rows[np.isin(rows["galaxy_id"].to_numpy(), ids)].drop_duplicates("galaxy_id")
         return rows[["galaxy_id", "ra", "dec", "redshift"]].assign(**true_shapes(rows))
 

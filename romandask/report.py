@@ -20,7 +20,7 @@ from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.survey import Survey
 from romandask.truth_match import reference_band
-from romandask.validation import colours_of, depths, residuals
+from romandask.validation import colours_of, depths, residuals, with_truth
 
 PAPER_DEPTHS = {"Y106": 26.9, "J129": 26.9, "H158": 26.9, "F184": 26.2}
 """5-sigma depths of point sources, AB mag (Troxel et al. 2023)."""
@@ -181,7 +181,11 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
     true, measured, middle, colours = {}, {}, {}, {}
     depth = {band: value for name in objects for band, value in depths(objects[name], survey.bands(name)).items()}
-    joined = {name: survey.objects_with_truth(name) for name in objects}
+    matched = {name: survey.truth_match_product(name).all_rows() for name in objects}
+    joined = {
+        name: with_truth(frame, matched[name], survey.truth_summary_product(name).all_rows())
+        for name, frame in objects.items()
+    }
     for name, frame in objects.items():
         bands = survey.bands(name)
         middle[name] = bands[len(bands) // 2]
@@ -219,7 +223,7 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
         + _image(
             pictures.completeness(
                 {name: survey.completeness(name) for name in survey.instruments},
-                {name: survey.truth_match_product(name).all_rows() for name in survey.instruments},
+                matched,
                 {name: reference_band(instrument) for name, instrument in survey.instruments.items()},
             ),
             "Objects against the truth: the share of true objects that was found, in true magnitudes, the share of "

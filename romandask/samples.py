@@ -28,10 +28,11 @@ def limits(objects: TableProduct, matched: TableProduct, settings: MatchSettings
     section 6), unless the settings tell it; infinite for samples of all objects, and where there are too few to fit.
     """
     stage = f"limits/{objects.stage.split('/')[1]}"
-    state = {"sample": settings.sample, "limit": (settings.limits or {}).get(band), "band": band, "flags": ALLOWED}
-    told = settings.sample == "all" or state["limit"] is not None
-    sources = () if told else tuple((p.stage, name) for p in (objects, matched) for name in p.names)
-    maker = _Limit(_Clean(objects, matched, (band,)), settings, band)
+    limit = (settings.limits or {}).get(band)
+    state = {"sample": settings.sample, "limit": limit, "band": band, "flags": ALLOWED}
+    told = np.inf if settings.sample == "all" else limit
+    sources = () if told is not None else tuple((p.stage, name) for p in (objects, matched) for name in p.names)
+    maker = _Limit(_Clean(objects, matched, (band,)), told, band)
     return TableProduct(stage, (Unit("all", state, sources),), maker, schema("limits"), bytes_per_unit=400 << 20)
 
 
@@ -93,21 +94,18 @@ class _Clean:
 @dataclass(frozen=True)
 class _Limit:
     rows: _Clean
-    settings: MatchSettings
+    told: float | None
     band: str
 
     def __call__(self, index: int) -> pd.DataFrame:
-        told = (self.settings.limits or {}).get(self.band)
-        limit, slope, counted = np.inf, np.nan, 0
-        if self.settings.sample == "clean" and told is None:
+        limit, slope, counted = self.told, np.nan, 0
+        if limit is None:
             counts = np.zeros(len(EDGES) - 1, np.int64)
             for k in range(len(self.rows.objects.units)):
                 frame = self.rows(k)
                 counts += np.histogram(frame.loc[frame["clean"], f"{self.band}_mag"], EDGES)[0]
             limit, slope = counts_limit(counts, EDGES)
             counted = int(counts.sum())
-        elif told is not None and self.settings.sample == "clean":
-            limit = told
         return pd.DataFrame({"band": [self.band], "limit": [limit], "slope": [slope], "objects": [counted]})
 
 

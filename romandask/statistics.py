@@ -5,6 +5,7 @@ An unrecognised blend is a group with one object of Rubin and two or more of Rom
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from romandask.matches import CODES, Matches, length_name
-from romandask.runtime.hats import RIM_ORDER, rim
+from romandask.runtime.hats import rows_around
 from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
@@ -121,21 +122,17 @@ def _described(groups: pd.DataFrame, samples: Samples, cell: int, order: int) ->
     band = samples.reference["rubin"]
     parts = []
     for code, (name, table) in enumerate(samples.tables.items()):
-        magnitudes = {f"{samples.reference[name]}_mag": "magnitude", f"{samples.colour[name]}_mag": "other"}
-        rows = table.rows_in(
-            np.array([cell]), order, ["objectId", *magnitudes, "half_light_radius", "truth_id", "star"]
-        )
-        values = {new: rows[old].to_numpy(float) for old, new in magnitudes.items()}
-        if len(magnitudes) == 1:
-            values["magnitude"] = values["other"]
+        magnitude, other = (f"{bands[name]}_mag" for bands in (samples.reference, samples.colour))
+        columns = ["objectId", magnitude, other, "half_light_radius", "truth_id", "star"]
+        rows = table.rows_in(np.array([cell]), order, columns)
+        values = {"magnitude": rows[magnitude].to_numpy(float), "other": rows[other].to_numpy(float)}
         key = rows["objectId"].to_numpy(np.int64) * CODES + code
         parts.append(rows[["half_light_radius", "truth_id", "star"]].assign(**values, key=key))
     frame = groups.merge(pd.concat(parts, ignore_index=True), on="key", validate="one_to_one")
     true = []
-    # a counterpart may lie beyond the border
-    places = [(np.array([cell]), order), (rim(cell, order), RIM_ORDER)]
     for star, product, number in ((False, samples.galaxies, "galaxy_id"), (True, samples.stars, "id")):
-        rows = pd.concat([product.rows_in(*place, [number, f"flux_{band}"]) for place in places])
+        # a counterpart may lie beyond the border
+        rows = rows_around(product, cell, order, [number, f"flux_{band}"])
         flux = rows[f"flux_{band}"].to_numpy(float)
         true.append(pd.DataFrame({"truth_id": rows[number].to_numpy(np.int64), "star": star, "true_flux": flux}))
     frame = frame.merge(pd.concat(true).drop_duplicates(["truth_id", "star"]), on=["truth_id", "star"], how="left")
@@ -185,7 +182,7 @@ def real(rows: pd.DataFrame, groups: Counted) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Table:
+class _Table(ABC):
     found: Matches
     samples: Samples
     lengths: tuple[float, ...]
@@ -196,8 +193,9 @@ class _Table:
             for length in self.lengths:
                 yield length, rows, counted(rows, length)
 
+    @abstractmethod
     def __call__(self, index: int) -> pd.DataFrame:
-        raise NotImplementedError
+        """Return the rows of the one unit."""
 
 
 class _Blends(_Table):

@@ -79,7 +79,8 @@ def test_tiles_are_marked_where_exposures_are_saturated(small):
     dq[rows, columns] = SATURATED
     dq[150, 150] = 2
     marked = np.zeros(shape, np.uint8)
-    mark_saturated(marked, dq, parts, source, target)
+    for part in parts:
+        mark_saturated(marked, dq, pixel_map(source, target, part.rows, part.columns))
     sums = Sums(shape, 1, 0.7)
     light = ((dq & SATURATED) > 0).astype(np.float32)
     sums.add(

@@ -75,6 +75,12 @@ def rim(pixel: int, order: int) -> np.ndarray:
     return np.unique(found[found >= 0])
 
 
+def rows_around(product: TableProduct, pixel: int, order: int, columns: list[str]) -> pd.DataFrame:
+    """Return some columns of the rows of a catalog in a HEALPix cell of any order and then along its outside."""
+    places = [(np.array([pixel]), order), (rim(pixel, order), RIM_ORDER)]
+    return pd.concat([product.rows_in(*place, columns) for place in places])
+
+
 def inner_rim(pixel: int, order: int) -> np.ndarray:
     """Return the cells of RIM_ORDER that lie along the inside of a cell."""
     around = np.unique(healpix.neighbours(rim(pixel, order).astype(np.uint64), RIM_ORDER).astype(np.int64))

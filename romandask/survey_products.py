@@ -34,7 +34,7 @@ from romandask.samples import limits, samples
 from romandask.statistics import SURVEYS, Samples, Statistics, statistics
 from romandask.truth import TruthCatalogs, truth
 from romandask.truth_index import truth_index
-from romandask.truth_match import reference_band, truth_match, truth_summary
+from romandask.truth_match import REFERENCE_BANDS, reference_band, truth_match, truth_summary
 from romandask.zero_points import zero_points
 
 
@@ -177,7 +177,8 @@ class SurveyProducts:
     def limit_product(self, survey: str) -> TableProduct:
         """The faintest magnitude of a survey's sample."""
         settings, bands = self.pipeline.matches, {reference_band(one): name for name, one in self.instruments.items()}
-        if unknown := set(settings.limits or {}) - set(bands):
+        # One pipeline's limits serve its runs with a survey, or that band, left out.
+        if unknown := set(settings.limits or {}) - {*bands, *REFERENCE_BANDS}:
             raise UserError(f"matches.limits: {', '.join(sorted(unknown))}: they are those of {', '.join(bands)}")
         band, matched = reference_band(self._instrument(survey)), self.truth_match_product(survey)
         return self._once("limits", survey, lambda: limits(self.object_product(survey), matched, settings, band))

@@ -23,6 +23,9 @@ from romandask.runtime.units import Unit
 BINS = np.arange(17.0, 30.01, 0.5)
 """Magnitudes between which completeness and purity are counted."""
 
+REFERENCE_BANDS = ("H158", "i")
+"""The bands in which Roman's and Rubin's magnitudes are compared, where they are surveyed."""
+
 
 def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
     """Return the lazy counterparts of the objects of each tile (schema: catalogs/truth_match.yaml), a unit a tile."""
@@ -46,10 +49,13 @@ def truth_summary(matched: TableProduct, detections: ImageProduct, settings: Det
     )  # fmt: skip
 
 
+REFERENCE_BANDS = ("H158", "i")
+
+
 def reference_band(instrument: Instrument) -> str:
     """Return the band in which magnitudes are compared: H158 of Roman, i of Rubin, or the middle one."""
     bands = instrument.bands
-    return next((band for band in ("H158", "i") if band in bands), bands[len(bands) // 2])
+    return next((band for band in REFERENCE_BANDS if band in bands), bands[len(bands) // 2])
 
 
 def completeness(summary: pd.DataFrame, matched: pd.DataFrame, band: str) -> pd.DataFrame:

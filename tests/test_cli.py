@@ -27,6 +27,7 @@ from conftest import command
         ),
         (["run", "tiny", "--store", "s", "coadds.pixels=12000"], ["GiB", "coadds.pixels", "run.memory_limit"]),
         (["plan", "tiny", "coadds.pixfrac=3"], ["coadds.pixfrac", "3"]),
+        (["plan", "tiny", "matches.limits={h158: 25}"], ["matches.limits", "h158", "H158, i"]),
         (["status", "s"], ["s: not a romandask store"]),
         (["report", "s"], ["s: not a romandask store"]),
         (["ingest", "skycatalogs", "nowhere", "--store", "s"], ["nowhere", "no such folder"]),
@@ -80,6 +81,13 @@ def test_plan_names_every_stage_and_writes_only_the_picture(tmp_path):
         assert stage in done.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["dag.svg"]
     assert "coadds" in (tmp_path / "dag.svg").read_text() or (tmp_path / "dag.svg").stat().st_size > 5000
+
+
+def test_one_survey_of_a_pipeline_is_planned_alone_with_the_limits_of_both(tmp_path):
+    for alone, other in (("rubin=null", "coadds/rubin"), ("roman=null", "coadds/roman")):
+        done = command("plan", "tiny", alone, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert other not in done.stdout
 
 
 def test_ingest_accounts_for_every_row(shared, tmp_path):

@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 from astropy.wcs import WCS
 
-from romandask.coadds import DrawTile, DrizzleTile
+from romandask.coadds import TileMaker
 from romandask.exposures import RenderExposure, empty_variance
 from romandask.instruments.exposure import exposure_of
 from romandask.kernels.detector import NO_DATA, usable
@@ -194,7 +194,7 @@ def _frames(product: ImageProduct) -> Frames:
             return instrument.header(exposure_of(table.iloc[unit]))
 
         return Frames(product, corners_of(table), instrument.shape, of_exposure, table["band"].to_numpy(object))
-    if isinstance(maker, DrizzleTile | DrawTile):
+    if isinstance(maker, TileMaker):
         source: RenderExposure = maker.exposures.make  # type: ignore[assignment]
         tiles, bands, scale = maker.tiles, source.instrument.bands, source.instrument.coadd_scale
         side = maker.settings.grid().side

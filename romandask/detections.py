@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.coadds import DrawTile, DrizzleTile
+from romandask.coadds import TileMaker
 from romandask.exposures import RenderExposure
 from romandask.kernels.detector import SATURATED
 from romandask.kernels.extract import (
@@ -46,7 +46,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     objectId; 0 for none. Beside each tile's is its table `objects`, each object in the one tile that owns it.
     """
     maker = coadds.make
-    if not isinstance(maker, DrizzleTile | DrawTile):
+    if not isinstance(maker, TileMaker):
         raise TypeError("detections need the product that coadds() returns")
     render, pixels = _render(maker), maker.pixels
     instrument, bands = render.instrument, render.instrument.bands
@@ -93,7 +93,7 @@ def objects(
     zero : offsets of the magnitudes (`zero_points()`), to be taken out; None leaves fluxes as they were measured
     """
     maker = coadds.make
-    assert isinstance(maker, DrizzleTile | DrawTile)
+    assert isinstance(maker, TileMaker)
     radius = maker.settings.grid().inner / 3600 * 0.75
     cells = region.cells(settings.order)
     tiles_of: dict[int, list[int]] = {int(cell): [] for cell in cells}
@@ -132,7 +132,7 @@ class DetectTile:
     def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
         """Return the map of a tile and the objects that it owns (schema: catalogs/objects.yaml)."""
         maker = self.coadds.make
-        assert isinstance(maker, DrizzleTile | DrawTile)
+        assert isinstance(maker, TileMaker)
         instrument, tile, settings = _render(maker).instrument, maker.tiles[index], self.settings
         bands = TileBands(self.coadds, instrument, index)
         combined = bands.detection()
@@ -154,7 +154,7 @@ class DetectTile:
         return {"segmentation": segments, "objects": objects}
 
 
-def tile_cone(tiles: DrawTile | DrizzleTile, index: int) -> tuple[float, float, float, float]:
+def tile_cone(tiles: TileMaker, index: int) -> tuple[float, float, float, float]:
     """Return centre and radii (degrees) of the cone around the unique area of a tile, for galaxies and stars."""
     tile, grid = tiles.tiles[index], tiles.settings.grid()
     radius = (grid.inner / np.sqrt(2) + 5) / 3600
@@ -193,6 +193,7 @@ def measure(
         "kron_radius": found.kron_radius * np.sqrt(found.a * found.b) * scale,
         "half_light_radius": found.half_light_radius * scale,
         "snr": found.snr,
+        "blendedness": found.blendedness,
         "extendedness": (found.half_light_radius > EXTENDED * psf_radius).astype(np.int8),
     }
     for band in bands.instrument.bands:
@@ -233,7 +234,7 @@ class CollectPartition:
         return found if self.zero is None else corrected(found, self.zero.load(0))
 
 
-def _render(maker: DrizzleTile | DrawTile) -> RenderExposure:
+def _render(maker: TileMaker) -> RenderExposure:
     render = maker.exposures.make
     assert isinstance(render, RenderExposure)
     return render

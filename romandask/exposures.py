@@ -5,7 +5,7 @@ With the full model of the SCAs also what was read (raw), of which the image is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,13 +15,16 @@ import pandas as pd
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from romandask.ccd_readout import CcdReadout
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of, exposures_of
 from romandask.instruments.roman import Roman
+from romandask.instruments.rubin import Rubin
 from romandask.kernels.detector import DQ_FLAGS, Detector, observe
 from romandask.kernels.galsim_engine import draw_objects
 from romandask.kernels.render import Stamps, draw, plan_stamps
 from romandask.kernels.sca_exposure import FLAGS
 from romandask.kernels.scene import Drawable, Truth, build_scene
+from romandask.kernels.silicon import LEAST, through_silicon
 from romandask.model.config import RenderSettings
 from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
@@ -66,7 +69,7 @@ class RenderExposure:
     instrument: Instrument
     render: RenderSettings
     seed: int
-    readout: ScaReadout | None = None
+    readout: ScaReadout | CcdReadout | None = None
     """None for the simple detector."""
     store: Store | None = None
     """Where what exposures left in traps may lie."""
@@ -101,6 +104,8 @@ class RenderExposure:
     def __call__(self, index: int) -> dict[str, Any]:
         """Return the arrays of the exposure at a row of the pointings table, by name, and its table of traps."""
         view = self.view(index)
+        if isinstance(self.readout, CcdReadout):
+            return self.through_ccd(view, self.readout)
         expected = self.expected(view)
         if self.readout is not None:
             light = expected + view.background
@@ -109,13 +114,35 @@ class RenderExposure:
         image, dq = observe(expected, view.background, self.instrument.detector, random)
         return {"image": image, "truth": expected, "dq": dq}
 
+    def through_ccd(self, view: View, readout: CcdReadout) -> dict[str, Any]:
+        """Return the arrays of an exposure of a CCD, its bright objects photon by photon where that is asked for."""
+        exposure, instrument, scene = view.exposure, readout.instrument, view.drawable.scene
+        bright = (scene.fluxes() >= LEAST) & (view.stamps.size > 0)
+        if instrument.settings.sensor == "ideal" or not bright.any():
+            expected = self.expected(view)
+            return {**readout(exposure, expected, view.background, None), "truth": expected}
+        chosen = np.flatnonzero(bright)
+        faint, shining = (
+            self.expected(replace(view, stamps=replace(view.stamps, size=np.where(part, view.stamps.size, 0))))
+            for part in (~bright, bright)
+        )
+
+        def seed(n: int) -> int:
+            return int(readout.random(exposure, "photons", int(scene.key[n])).integers(1, 1 << 31))
+
+        caught = through_silicon(
+            scene, chosen, view.stamps.size, Profiles(instrument, exposure), instrument.bandpass(exposure.band).nodes,
+            instrument.shape, instrument.pixel_scale, seed,
+        )  # fmt: skip
+        return {**readout(exposure, faint, view.background, caught), "truth": faint + shining}
+
     def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
         """Return the exposures before one whose afterglow it has, each with what it left in traps."""
         return [(exposure_of(self.table.iloc[row]), self.trapped(row)) for row in before(self.table, index).tolist()]
 
     def trapped(self, index: int) -> pd.DataFrame:
         """Return what an exposure left in traps: read where it is stored, worked out where not."""
-        assert self.readout is not None
+        assert isinstance(self.readout, ScaReadout)
         exposure, stage = exposure_of(self.table.iloc[index]), stage_of(self.instrument)
         if self.store is not None and read_record(self.store, stage, exposure.name):
             return to_frame(read_parquet(table_beside(self.store, stage, "trapped", exposure.name)))
@@ -180,11 +207,14 @@ def exposures(
         "knot_smoothing": instrument.knot_smoothing,
     }
     every = exposures_of(table)
-    readout = None
+    readout: ScaReadout | CcdReadout | None = None
     if calibration is not None:
         if not isinstance(instrument, Roman):
             raise TypeError(f"{instrument.name}: calibrations are those of Roman's SCAs")
         readout = ScaReadout(instrument, calibration, seed)
+    elif isinstance(instrument, Rubin):
+        readout = CcdReadout(instrument, seed)
+        common |= instrument.settings.model_dump(include={"atmosphere", "outer_scale", "sensor", "cosmic_rays"})
     names = [exposure.name for exposure in every]
     corners = corners_of(table)
 
@@ -193,7 +223,7 @@ def exposures(
         # PSFs are those of a detector and band
         kin = f"{every[row].band}-{every[row].detector}"
         settings = {**common, "row": row, **vars(every[row])}
-        if readout is None:
+        if not isinstance(readout, ScaReadout):
             return Unit(names[row], settings, inputs, kin=kin)
         earlier = before(table, row).tolist()
         # what an exposure leaves depends on its own light alone: on what was before it nothing else depends
@@ -220,7 +250,7 @@ def exposures(
         stage_of(instrument),
         LazyUnits(tuple(names), unit),
         RenderExposure(table, truth, instrument, render, seed, readout, store),
-        _variables(instrument.shape, readout is not None),
+        _variables(instrument.shape, readout),
         axes,
         (len(table),),
         coordinates,
@@ -230,19 +260,24 @@ def exposures(
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (500 << 20),
         # sky, noise and storage, every effect and its calibration; then objects
         seconds_per_unit=ny * nx * ((2.5e-7 if readout is None else 7e-7) + instrument.pixel_scale**2 / 3600 * 0.15),
-        tables={} if readout is None else {"trapped": schema("trapped")},
+        tables={"trapped": schema("trapped")} if isinstance(readout, ScaReadout) else {},
     )
 
 
-def _variables(shape: tuple[int, int], full: bool) -> tuple[Variable, ...]:
-    """Return the arrays of an exposure, with the full model of the detector or the simple one."""
+def _variables(shape: tuple[int, int], readout: ScaReadout | CcdReadout | None) -> tuple[Variable, ...]:
+    """Return the arrays of an exposure, as it is read out."""
+    truth = Variable(
+        "truth", "float32", shape, ("y", "x"), {"units": "electron", "long_name": "noiseless image of the objects"}
+    )
+    if isinstance(readout, CcdReadout):
+        return (*readout.variables, truth)
+    full = readout is not None
     bits = {**DQ_FLAGS, **FLAGS} if full else DQ_FLAGS
     masks = {"long_name": "data quality", "flag_masks": list(bits.values()), "flag_meanings": " ".join(bits)}
     electrons = {"units": "electron"}
     image = "calibrated image, sky included" if full else "observed image"
     found = [
         ("image", "float32" if full else "int32", {**electrons, "long_name": image}),
-        ("truth", "float32", {**electrons, "long_name": "noiseless image of the objects"}),
         ("dq", "uint16" if full else "uint8", masks),
     ]
     if full:
@@ -250,7 +285,7 @@ def _variables(shape: tuple[int, int], full: bool) -> tuple[Variable, ...]:
             ("raw", "uint16", {"units": "DN", "long_name": "what was read"}),
             ("variance", "float32", {"units": "electron2", "long_name": "variance of the image"}),
         ]
-    return tuple(Variable(name, kind, shape, ("y", "x"), attributes) for name, kind, attributes in found)
+    return (*(Variable(name, kind, shape, ("y", "x"), attributes) for name, kind, attributes in found), truth)
 
 
 def empty_variance(

@@ -109,12 +109,12 @@ def stages(survey: Survey) -> list[Stage]:
     found += [
         Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
         for name, instrument in survey.instruments.items()
-        if instrument.coadd_from == "exposures"
+        if instrument.coadd != "draw"
     ]
     found += [
         Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
         for name, instrument in survey.instruments.items()
-        if instrument.coadd_from == "exposures"
+        if instrument.coadd != "draw"
     ]
     for kind in ("coadd", "detection"):
         found += [

@@ -54,7 +54,7 @@ class Pipeline(Section):
         if self.roman is not None:
             found["roman"] = Roman(self.roman, self.render.n_waves, self.calibration())
         if self.rubin is not None:
-            found["rubin"] = Rubin(self.rubin, self.render.n_waves)
+            found["rubin"] = Rubin(self.rubin, self.render.n_waves, seed=self.seed)
         return found
 
     def calibration(self) -> CalibrationSource | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.wcs import WCS
 
-from romandask.coadds import DrizzleTile
+from romandask.drizzled_tiles import DrizzleTile
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import exposure_of
 from romandask.kernels.drizzle import Sums

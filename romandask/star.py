@@ -10,7 +10,7 @@ import xarray as xr
 from astropy.wcs import WCS
 
 from romandask.coadd_psfs import jacobian, psf_side, star_on
-from romandask.coadds import DrizzleTile
+from romandask.drizzled_tiles import DrizzleTile
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of
 from romandask.kernels.coadd_psf import drizzled_psf

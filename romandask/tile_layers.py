@@ -60,7 +60,7 @@ class TileBands:
         give_back()
         rate = self.instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT
         exposures = None
-        if self.instrument.coadd_from != "exposures":
+        if self.instrument.coadd != "drizzle":
             exposures, rate = self.arrays(band, ("nimages",))["nimages"], rate * VISIT
         image = self.arrays(band, ("image",))["image"]
         return Layer(image, error, mask, ratios, psf, spread, rate, rms, exposures)

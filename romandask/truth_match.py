@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from romandask.coadds import DrawTile, DrizzleTile
+from romandask.coadds import TileMaker
 from romandask.detections import DetectTile, owned, tile_cone
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Instrument
@@ -145,11 +145,11 @@ def _units(detections: ImageProduct, source: str, state: dict) -> tuple[Unit, ..
     )
 
 
-def _makers(detections: ImageProduct) -> tuple[DetectTile, DrawTile | DrizzleTile, RenderExposure]:
+def _makers(detections: ImageProduct) -> tuple[DetectTile, TileMaker, RenderExposure]:
     maker = detections.make
     assert isinstance(maker, DetectTile)
     tiles = maker.coadds.make
-    assert isinstance(tiles, DrizzleTile | DrawTile)
+    assert isinstance(tiles, TileMaker)
     render = tiles.exposures.make
     assert isinstance(render, RenderExposure)
     return maker, tiles, render

@@ -11,7 +11,8 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy import ndimage
 
-from romandask.coadds import coadds, mark_saturated
+from romandask.coadds import coadds
+from romandask.drizzled_tiles import mark_saturated
 from romandask.exposures import RenderExposure, wcs_of
 from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman import Roman, RomanSettings

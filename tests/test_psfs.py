@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from romandask.instruments.roman import RomanSettings
-from romandask.instruments.rubin import Rubin, RubinSettings, fried, kolmogorov_transfer, von_karman_transfer
+from romandask.instruments.rubin import Rubin, RubinSettings
+from romandask.kernels.seeing import fried, kolmogorov_transfer, von_karman_transfer
 from romandask.psfs import OVERSAMPLING, SIDE, flat_shares, psf_image, psfs
 
 

@@ -10,12 +10,12 @@ from astropy.wcs import WCS
 from romandask.formats.spectra import galaxy_templates
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman import Roman, RomanSettings
-from romandask.instruments.rubin import kolmogorov_transfer
 from romandask.kernels import render
 from romandask.kernels.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, knot_offset
-from romandask.kernels.psf import radial_model, sample_model
+from romandask.kernels.psf import sample_model
 from romandask.kernels.render import Scene, plan_stamps, stamp_sizes
 from romandask.kernels.scene import build_scene, magnification, pixel_positions, shape_matrices
+from romandask.kernels.seeing import kolmogorov_transfer, radial_model
 from romandask.model.tiles import tangent_header
 from romandask.truth import bind
 

@@ -82,12 +82,14 @@ class Instrument(Protocol):
     """How bands are combined to the detection image."""
     detection_bands: tuple[str, ...] | None
     """Bands that enter it; None for all."""
-    coadd_from: Literal["exposures", "pointings"]
-    """Whether coadds are resampled from exposures or drawn directly from the cadence."""
 
     @property
     def bands(self) -> tuple[str, ...]:
         """Bands of this pipeline."""
+
+    @property
+    def coadd(self) -> Literal["drizzle", "warp", "draw"]:
+        """How tiles are made: drizzled or warped from exposures, or drawn directly from the cadence."""
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass, with the wavelengths at which the PSF is known."""

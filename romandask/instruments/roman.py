@@ -116,7 +116,7 @@ class Roman:
     aperture: float = 0.5
     detection: Literal["median", "mean"] = "median"
     detection_bands: tuple[str, ...] | None = None
-    coadd_from: Literal["exposures", "pointings"] = "exposures"
+    coadd: Literal["drizzle"] = "drizzle"
     detector: Detector = Detector(saturation=1e5, read_noise=galsim.roman.read_noise)
 
     @property

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import galsim
 import numpy as np
 import pandas as pd
 from pydantic import Field, model_validator
-from scipy.special import gamma, kv
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.rubin_cadence import cadence
 from romandask.kernels.bandpasses import rubin_bandpass
 from romandask.kernels.depth import SYSTEM_FWHM
 from romandask.kernels.detector import Detector
-from romandask.kernels.psf import BrightPsf, PsfModel, radial_model
+from romandask.kernels.psf import BrightPsf, PsfModel, place_grid
+from romandask.kernels.seeing import (
+    Pattern,
+    elliptical_model,
+    fried,
+    kolmogorov_transfer,
+    pattern,
+    radial_model,
+    von_karman_transfer,
+)
 from romandask.model.config import Section
+from romandask.model.seeds import rng
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
@@ -29,9 +39,16 @@ DARK = 0.2
 """Electrons a second."""
 STAMP = 512
 """Largest stamp, pixels."""
+DEGREE = 3
+"""Of the polynomials by which the PSF varies over a detector."""
 MARGIN = 0.3
 """Degrees by which tiles may stick out of the region that they cover."""
 
+
+SIGMA = 2.3548200450309493
+"""FWHM of a Gaussian over its sigma."""
+FREQUENCY = np.linspace(0, 2.2 * np.pi * np.sqrt(2) / SCALE, 3000)
+"""Radial frequencies at which transforms of PSFs are known, 1/arcsec."""
 
 Band = Literal["u", "g", "r", "i", "z", "y"]
 
@@ -52,7 +69,13 @@ class RubinSettings(Section):
     """The Rubin block of a pipeline."""
 
     bands: tuple[Band, ...] = ("u", "g", "r", "i", "z", "y")
-    mode: Literal["coadd"] = "coadd"
+    mode: Literal["coadd", "visits"] = Field(
+        "coadd", description="coadd: tiles are drawn directly; visits: each visit and detector, then warped and coadded"
+    )
+    sensor: Literal["ideal", "silicon"] = Field(
+        "ideal", description="silicon: bright objects go through GalSim's model of the CCD, photon by photon (visits)"
+    )
+    cosmic_rays: bool = Field(True, description="in visits")
     pointings: RubinPointings = RubinPointings()
     atmosphere: Literal["kolmogorov", "von_karman"] = "kolmogorov"
     outer_scale: float = Field(25.0, gt=1, description="outer scale of von Karman turbulence, m")
@@ -81,13 +104,19 @@ class Rubin:
     aperture: float = 1.5
     detection: Literal["median", "mean"] = "mean"
     detection_bands: tuple[str, ...] | None = None
-    coadd_from: Literal["exposures", "pointings"] = "pointings"
     detector: Detector = Detector(saturation=1e5, read_noise=9.0)
+    seed: int = 0
+    """Of the survey: visits have their own turbulence."""
 
     @property
     def bands(self) -> tuple[str, ...]:
         """Bands of this pipeline."""
         return self.settings.bands
+
+    @property
+    def coadd(self) -> Literal["draw", "warp"]:
+        """Whether tiles are drawn from the cadence, or made of its exposures."""
+        return "draw" if self.settings.mode == "coadd" else "warp"
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""
@@ -134,16 +163,17 @@ class Rubin:
         return _header(exposure, exposure.detector, self.shape)
 
     def psf(self, exposure: Exposure) -> PsfModel:
-        """Return the PSF of an exposure: atmosphere and Gaussian system, both with airmass^0.6."""
-        return self.effective_psf([exposure], np.ones(1))
+        """Return the PSF of an exposure: atmosphere and telescope, both with airmass^0.6, varying over the field."""
+        return _psf(_Varying(self.psf_key(exposure), self, exposure))
 
     def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
-        """Return the PSF of an exposure: it is the same everywhere."""
-        return self.psf(exposure)
+        """Return the PSF of an exposure at a place of the detector."""
+        return self.model(exposure, np.array([x]), np.array([y]), np.empty((0, 2)), 0)
 
     def psf_key(self, exposure: Exposure) -> tuple:
-        """Return what tells PSFs apart: each exposure has its own seeing."""
-        return "rubin", exposure.band, self.n_waves, exposure.seeing, exposure.airmass
+        """Return what tells PSFs apart: each exposure has its own."""
+        turbulence = self.settings.atmosphere, self.settings.outer_scale, exposure.seeing, exposure.airmass, self.seed
+        return "rubin", exposure.band, self.n_waves, self.shape, exposure.visit, exposure.detector, *turbulence
 
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return how bright a unit star is at the edges of stamps."""
@@ -154,9 +184,13 @@ class Rubin:
         return ()
 
     def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
-        """Return GalSim's PSFs, one a node: the same at every place (pixels) of the detector."""
+        """Return GalSim's PSFs, one a node, at a place (pixels) of the detector."""
         thickness = exposure.airmass**0.6
-        system = galsim.Gaussian(fwhm=SYSTEM_FWHM * thickness)
+        xx, yy, xy = self._covariance(exposure, np.array([x]), np.array([y]))[0]
+        size = np.sqrt(xx * yy - xy**2)
+        # a Gaussian of that covariance: distortion (xx - yy) / (xx + yy) and 2 xy / (xx + yy)
+        shear = galsim.Shear(e1=(xx - yy) / (xx + yy), e2=2 * xy / (xx + yy))
+        system = galsim.Gaussian(sigma=np.sqrt(size)).shear(shear)
         return [
             galsim.Convolve(self._atmosphere(exposure.seeing * (wave / 500) ** -0.3 * thickness, wave), system)
             for wave in self.bandpass(exposure.band).nodes
@@ -167,24 +201,51 @@ class Rubin:
             return galsim.Kolmogorov(fwhm=float(fwhm))
         return galsim.VonKarman(lam=float(wave), r0=fried(fwhm, wave), L0=self.settings.outer_scale)
 
+    def _transfer(self, frequency: np.ndarray, fwhm: np.ndarray, wave: float, gaussian: np.ndarray) -> np.ndarray:
+        """Return the transform of the atmosphere, of a FWHM, and of a round Gaussian, of another (arcsec)."""
+        if self.settings.atmosphere == "kolmogorov":
+            return kolmogorov_transfer(frequency, fwhm, gaussian)
+        return von_karman_transfer(frequency, fwhm, gaussian, wave, self.settings.outer_scale)
+
+    def _covariance(self, exposure: Exposure, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the covariance (n, 3), arcsec2, of the Gaussian part of the PSF at places of a detector, pixels.
+
+        It is the telescope's and what the atmosphere, at 500 nm, differs by from its mean: turbulence.
+        """
+        ny, nx = self.shape
+        u, v = _CENTRES[exposure.detector][:, None] + SCALE * (np.stack([x, y]) - [[(nx - 1) / 2], [(ny - 1) / 2]])
+        here, thickness = _pattern(self.seed, exposure.visit), exposure.airmass**0.6
+        telescope = (SYSTEM_FWHM * thickness / SIGMA) ** 2 * here.telescope(u, v)
+        return telescope + (exposure.seeing * thickness / SIGMA) ** 2 * here.atmosphere(u, v)
+
+    def model(self, exposure: Exposure, x: np.ndarray, y: np.ndarray, places: np.ndarray, degree: int) -> PsfModel:
+        """Return the PSF at a place (1,) of an exposure, pixels, and by how much it differs at the places (n, 2)."""
+        thickness = exposure.airmass**0.6
+        transfers = [
+            self._transfer(FREQUENCY, np.array(exposure.seeing * (wave / 500) ** -0.3 * thickness), wave, np.array(0.0))
+            for wave in self.bandpass(exposure.band).nodes
+        ]
+        middle, others = self._covariance(exposure, x, y)[0], self._covariance(exposure, *places.T)
+        return elliptical_model(FREQUENCY, np.array(transfers), middle, others, degree, self.shape, SCALE, STAMP)
+
     def effective_psf(self, exposures: list[Exposure], weights: np.ndarray, size: int = STAMP) -> PsfModel:
-        """Return the weighted mean PSF of some exposures of one band, on this instrument's pixels."""
-        nodes = self.bandpass(exposures[0].band).nodes
+        """Return the weighted mean PSF of some exposures of one band, on this instrument's pixels.
+
+        It is round: of hundreds of exposures, each turned and dithered, no ellipticity is left. Their sizes are those
+        in the middle of their detectors.
+        """
         share = np.asarray(weights) / np.sum(weights)
         seeing = np.array([exposure.seeing for exposure in exposures])
         thickness = np.array([exposure.airmass for exposure in exposures]) ** 0.6
-        frequency = np.linspace(0, 2.2 * np.pi * np.sqrt(2) / SCALE, 3000)
-        transfers = []
-        for wave in nodes:
-            fwhm = seeing * (wave / 500) ** -0.3 * thickness
-            system = SYSTEM_FWHM * thickness[:, None]
-            if self.settings.atmosphere == "kolmogorov":
-                transfer = kolmogorov_transfer(frequency[None], fwhm[:, None], system)
-            else:
-                outer = self.settings.outer_scale
-                transfer = von_karman_transfer(frequency[None], fwhm[:, None], system, wave, outer)
-            transfers.append(share @ transfer)
-        return radial_model(frequency, np.array(transfers), SCALE, size)
+        ny, nx = self.shape
+        middle = np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2])
+        size2 = np.array([self._covariance(exposure, *middle)[0, :2].mean() for exposure in exposures])
+        gaussian = (np.sqrt(size2) * SIGMA)[:, None]
+        transfers = [
+            share @ self._transfer(FREQUENCY, (seeing * (wave / 500) ** -0.3 * thickness)[:, None], wave, gaussian)
+            for wave in self.bandpass(exposures[0].band).nodes
+        ]
+        return radial_model(FREQUENCY, np.array(transfers), SCALE, size)
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of sky and dark current."""
@@ -201,35 +262,25 @@ class Rubin:
         return self.sky_noise(exposure, (SCALE**2 * sky + DARK) * exposure.exptime)
 
 
-def kolmogorov_transfer(frequency: np.ndarray, atmosphere: np.ndarray, system: np.ndarray) -> np.ndarray:
-    """Return the transform, at radial frequencies in 1/arcsec (2 pi / period), of Kolmogorov seeing and a Gaussian.
-
-    `atmosphere` and `system` are FWHM in arcsec. Kolmogorov's transform is exp(-3.4419 (k lambda / 2 pi r0)^(5/3)) with
-    FWHM = 0.97586 lambda / r0 (Fried 1966; the constants are GalSim's).
-    """
-    kolmogorov = np.exp(-3.4418970 * (frequency * atmosphere / (2 * np.pi * 0.9758634299)) ** (5 / 3))
-    return kolmogorov * np.exp(-((frequency * system / 2.3548200450309493) ** 2) / 2)
+@lru_cache(maxsize=4096)
+def _pattern(seed: int, visit: int) -> Pattern:
+    return pattern(rng(seed, "exposures", "rubin", "psf", visit))
 
 
-def fried(fwhm: np.ndarray | float, wave: float) -> np.ndarray | float:
-    """Return r0, m, of Kolmogorov seeing of a FWHM, arcsec, at a wavelength, nm (Fried 1966)."""
-    return 0.9758634299 * wave * 1e-9 / (fwhm * np.pi / 648000)
+@dataclass(frozen=True)
+class _Varying:
+    """The PSF of an exposure: one with the same key is the same."""
+
+    key: tuple
+    rubin: Rubin = field(compare=False)
+    exposure: Exposure = field(compare=False)
 
 
-def von_karman_transfer(
-    frequency: np.ndarray, atmosphere: np.ndarray, system: np.ndarray, wave: float, outer_scale: float
-) -> np.ndarray:
-    """Return the transform of von Karman seeing and a Gaussian: turbulence whose power ends at an outer scale.
-
-    Arguments and units are those of `kolmogorov_transfer`, `atmosphere` the FWHM without the outer scale; `wave` in nm,
-    `outer_scale` in m. The structure function is Conan's (2008, equation 16).
-    """
-    separation = np.maximum(frequency * (648000 / np.pi) * wave * 1e-9 / (2 * np.pi), 1e-9)
-    x = 2 * np.pi * separation / outer_scale
-    constant = 2 ** (1 / 6) * gamma(11 / 6) / np.pi ** (8 / 3) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
-    structure = (outer_scale / fried(atmosphere, wave)) ** (5 / 3) * constant
-    structure = structure * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x))
-    return np.exp(-structure / 2) * np.exp(-((frequency * system / 2.3548200450309493) ** 2) / 2)
+@lru_cache(maxsize=1)
+def _psf(of: _Varying) -> PsfModel:
+    ny, nx = of.rubin.shape
+    middle = np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2])
+    return of.rubin.model(of.exposure, *middle, place_grid(of.rubin.shape, DEGREE), DEGREE)
 
 
 def detector_centres() -> np.ndarray:

@@ -33,10 +33,18 @@ def drizzled_psf(
     qx, qy = inverse[0, 0] * kx + inverse[1, 0] * ky, inverse[0, 1] * kx + inverse[1, 1] * ky
     spread = np.sinc(pixfrac * kx) * np.sinc(pixfrac * ky) * np.sinc(qx) * np.sinc(qy)
     smooth = fft.irfft2(fft.rfft2(np.asarray(fine, float)) * spread, s=fine.shape)
+    return warped_psf(smooth, oversampling, jacobian, side, step)
+
+
+def warped_psf(
+    fine: np.ndarray, oversampling: int, jacobian: np.ndarray, side: int, step: float = 1.0
+) -> np.ndarray:  # fmt: skip
+    """Return a unit star as it is in an exposure that is interpolated onto a tile, (side, side); the rest as above."""
+    inverse, middle = np.linalg.inv(jacobian), len(fine) // 2
     offset = (np.arange(side) - (side - 1) / 2) * step
     u, v = np.meshgrid(offset, offset)
     x, y = inverse[0, 0] * u + inverse[0, 1] * v, inverse[1, 0] * u + inverse[1, 1] * v
-    found = lanczos(smooth, x.ravel() * oversampling + n // 2, y.ravel() * oversampling + n // 2)
+    found = lanczos(np.asarray(fine, float), x.ravel() * oversampling + middle, y.ravel() * oversampling + middle)
     return found.reshape(side, side) / abs(np.linalg.det(jacobian))
 
 

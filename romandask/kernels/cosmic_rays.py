@@ -19,21 +19,30 @@ LONGEST = 100.0
 """Depths: a longer path, all but along the layer, ends where its particle stops."""
 
 
-def tracks(shape: tuple[int, int], exptime: float, rng: np.random.Generator) -> np.ndarray:
+def tracks(
+    shape: tuple[int, int],
+    exptime: float,
+    rng: np.random.Generator,
+    rate: float = RATE,
+    depth: float = DEPTH,
+    charge: float = CHARGE,
+) -> np.ndarray:
     """Return the tracks (n, 5) of an exposure: x, y (pixels), length in x and in y (pixels), charge (electrons).
+
+    Rate, depth and charge a micrometre are, if not given, those of Roman's SCAs.
 
     Particles come from all sides alike, so that through the layer's surface they come with the cosine of their angle.
     """
     area = shape[0] * shape[1] * (PIXEL * 1e-4) ** 2
-    n = rng.poisson(RATE * area * exptime)
+    n = rng.poisson(rate * area * exptime)
     # the flux through a surface goes as cos, so cos^2 is uniform
     cosine = np.sqrt(rng.uniform(0, 1, n))
-    path = np.minimum(DEPTH / np.maximum(cosine, 1e-9), DEPTH * LONGEST)
+    path = np.minimum(depth / np.maximum(cosine, 1e-9), depth * LONGEST)
     across = path * np.sqrt(1 - cosine**2) / PIXEL
     angle = rng.uniform(0, 2 * np.pi, n)
     normal = rng.standard_normal(n)
     # Moyal: minus the logarithm of the square of a normal number
-    loss = CHARGE * (1 + SPREAD * -np.log(np.maximum(normal**2, 1e-12)))
+    loss = charge * (1 + SPREAD * -np.log(np.maximum(normal**2, 1e-12)))
     x, y = rng.uniform(-0.5, shape[1] - 0.5, n), rng.uniform(-0.5, shape[0] - 0.5, n)
     return np.stack([x, y, across * np.cos(angle), across * np.sin(angle), np.maximum(loss, 0) * path], axis=1)
 

@@ -8,7 +8,7 @@ import numpy as np
 import sep
 from scipy import ndimage
 
-from romandask.kernels.apertures import kron_radii, sums
+from romandask.kernels.apertures import blendedness, kron_radii, sums
 from romandask.kernels.layer import TRIALS, Layer, at
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
@@ -53,6 +53,8 @@ class Found:
     kron_radius: np.ndarray
     half_light_radius: np.ndarray
     snr: np.ndarray
+    blendedness: np.ndarray
+    """Share of the light under the object's Gaussian that is its neighbours'; NaN where there is none."""
     flags: np.ndarray
 
 
@@ -94,9 +96,10 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = np.where(flux_error > 0, flux / flux_error, 0.0)
     half = np.where(np.isfinite(half) & (half > 0), half, 1.0)
+    blended = blendedness(image, mask, segments, label, x, y, found["x2"], found["y2"], found["xy"])
     xw, yw = _windowed(image, mask, x, y, half)
     return Found(
-        label, xw, yw, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr,
+        label, xw, yw, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr, blended,
         (found["flag"] | dark | flag | half_flag).astype(np.int32) | extra,
     ), segments  # fmt: skip
 

@@ -278,12 +278,12 @@ def sample(profile: galsim.GSObject, pixel_scale: float, grid: Grid, diffusion: 
     profile._drawKImage(image)
     out = np.zeros(grid.shape, np.complex64)
     # the last column, half the sampling frequency of the folded grid, is beyond every profile's reach
-    np.multiply(image.array, _response(grid, diffusion)[:, :-1], out=out[:, :-1])
+    np.multiply(image.array, response_of(grid, diffusion)[:, :-1], out=out[:, :-1])
     out[0] = 0
     return out
 
 
-def _response(grid: Grid, diffusion: float) -> np.ndarray:
+def response_of(grid: Grid, diffusion: float) -> np.ndarray:
     """Return the transform of a square pixel and of the diffusion of charge."""
     up, across = (np.sinc(axis / (2 * np.pi)) * np.exp(-((axis * diffusion) ** 2) / 2) for axis in grid.axes())
     return (up[:, None] * across[None, :]).astype(np.float32)
@@ -307,22 +307,6 @@ def sample_model(profiles: list[galsim.GSObject], pixel_scale: float, size: int,
     """
     grid = Grid(size, folds_of(profiles, pixel_scale))
     return model(np.stack([sample(profile, pixel_scale, grid, diffusion) for profile in profiles]), grid)
-
-
-def radial_model(
-    frequency: np.ndarray, transfers: np.ndarray, pixel_scale: float, size: int, diffusion: float = 0.0
-) -> PsfModel:
-    """Return the model of round PSFs from their transforms (nodes, n) at radial frequencies (n,), 1/arcsec."""
-    grid = Grid(size, 2)
-    rows, columns = grid.axes()
-    response = _response(grid, diffusion)
-    radius = np.hypot(rows[:, None], columns[None, :]) / pixel_scale
-    transforms = np.zeros((len(transfers), *grid.shape), np.complex64)
-    for out, transfer in zip(transforms, transfers, strict=True):
-        out[:] = np.interp(radius, frequency, transfer, right=0.0) * response
-    transforms[:, 0, :] = 0
-    transforms[:, :, -1] = 0
-    return model(transforms, grid)
 
 
 def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> PsfModel:

@@ -21,3 +21,8 @@ def rng(seed: int, stage: str, *identity: int | str) -> np.random.Generator:
     digest = hashlib.blake2b(json.dumps(words).encode(), digest_size=16).digest()
     key = np.frombuffer(digest, dtype="<u4")
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence([int(seed), *map(int, key)])))
+
+
+def realisation_key(realisation: int) -> tuple[int, ...]:
+    """Return what tells the random numbers of a noise realisation from those of the first."""
+    return (realisation,) if realisation else ()

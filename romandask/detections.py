@@ -16,6 +16,7 @@ from romandask.kernels.extract import (
     Found,
     aperture_fluxes,
     detect,
+    detect_peaks,
     kron_fluxes,
     psf_fluxes,
     psf_half_light_radius,
@@ -136,16 +137,18 @@ class DetectTile:
         instrument, tile, settings = _render(maker).instrument, maker.tiles[index], self.settings
         bands = TileBands(self.coadds, instrument, index)
         combined = bands.detection()
-        found, segments = detect(
-            combined, settings.threshold, settings.min_area, settings.deblend_levels, settings.deblend_contrast
-        )
+        if instrument.detection == "median":
+            levels = settings.deblend_levels, settings.deblend_contrast
+            found, segments = detect(combined, settings.threshold, settings.min_area, *levels, settings.min_snr)
+        else:
+            found, segments = detect_peaks(combined, settings.threshold, settings.min_area, settings.min_snr)
         radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
         # a band at a time is in memory
         del combined
         give_back()
         wcs = WCS(tile.header(maker.pixels, instrument.coadd_scale))
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
-        keep = owned(ra, dec, tile, maker.settings.grid(), self.region) & (found.snr >= settings.min_snr)
+        keep = owned(ra, dec, tile, maker.settings.grid(), self.region)
         objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, segments, radius)
         at = unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy())
         dust = _render(maker).truth.milky_way(at, *tile_cone(maker, index)[:3])

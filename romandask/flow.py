@@ -87,6 +87,7 @@ _SETTING = {
     "truth/structure": "lower truth.nside",
     "truth": "raise truth.order",
     "objects": "raise detections.order",
+    "differences": "lower coadds.pixels",
     "matches": "raise matches.order",
     "chance": "raise matches.order",
     "samples": "raise detections.order",
@@ -132,7 +133,13 @@ def stages(survey: Survey) -> list[Stage]:
         found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
         sample = f"samples/{name}"
         found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
-    found += [Stage(f"shear/{name}", lambda s, name=name: s.shear_product(name)) for name in names]
+    if survey.differs:
+        found.append(Stage("differences/rubin", lambda s: s.difference_product))
+    for part, stage in (("shapes", "shapes"), ("pairs", "shear_pairs"), ("shear", "shear")):
+        found += [
+            Stage(f"{stage}/{name}", lambda s, part=part, name=name: getattr(s.lensing_products(name), part))
+            for name in names
+        ]
     if {"roman", "rubin"} <= set(names):
         for kind, products in (("matches", "match_products"), ("chance", "chance_products")):
             found += [

@@ -27,7 +27,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     tiles : by survey, the images by band and the pixel scale (arcsec)
     objects : by survey, the detected objects of the tile, circled
     """
-    figure = _figure(7.2 * len(tiles), 7.4)
+    figure = figure_of(7.2 * len(tiles), 7.4)
     extent = min(min(next(iter(bands.values())).shape) * scale for bands, scale in tiles.values())
     # very large tiles are shown by their middle, the same sky for every survey
     extent = min(extent, LARGEST * min(scale for _, scale in tiles.values()))
@@ -39,7 +39,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
         count = int(extent / scale)
         first = (side - count) // 2
         cut = slice(first, first + count)
-        planes = [_in_sigma(bands[name][cut, cut]) for name in chosen]
+        planes = [in_sigma(bands[name][cut, cut]) for name in chosen]
         picture = make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0)
         half = count * scale / 2
         axes.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
@@ -51,14 +51,14 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
         axes.set_ylim(-half, half)
         axes.set_title(f"{survey}: {', '.join(chosen)}; {scale:g} arcsec pixels")
         axes.set_xlabel("arcsec west")
-    return _png(figure)
+    return png(figure)
 
 
 def effects(images: dict[str, np.ndarray]) -> bytes:
     """Return difference images (electrons), a panel an effect, each with its own scale."""
     columns = 4
     rows = -(-len(images) // columns)
-    figure = _figure(3.3 * columns, 3.1 * rows)
+    figure = figure_of(3.3 * columns, 3.1 * rows)
     for position, (name, image) in enumerate(images.items()):
         axes = figure.add_subplot(rows, columns, position + 1)
         # what is everywhere decides the scale, or a tenth of the strongest where that is rare
@@ -69,12 +69,12 @@ def effects(images: dict[str, np.ndarray]) -> bytes:
         axes.set_xticks([])
         axes.set_yticks([])
         figure.colorbar(shown, ax=axes, shrink=0.85)
-    return _png(figure)
+    return png(figure)
 
 
 def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
     """Return weight and number of exposures of a tile in one band, by survey: (weight, nimages, band)."""
-    figure = _figure(4.2 * 2 * len(tiles), 3.9)
+    figure = figure_of(4.2 * 2 * len(tiles), 3.9)
     position = 0
     for survey, (weight, count, band) in tiles.items():
         for values, name in ((weight, "weight"), (count, "exposures")):
@@ -85,7 +85,7 @@ def maps(tiles: dict[str, tuple[np.ndarray, np.ndarray, str]]) -> bytes:
             axes.set_title(f"{survey} {band} {name}", fontsize=10)
             axes.set_axis_off()
             figure.colorbar(shown, ax=axes, fraction=0.046)
-    return _png(figure)
+    return png(figure)
 
 
 def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float, bands: tuple[str, ...]) -> bytes:
@@ -93,7 +93,7 @@ def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float
 
     `area` is in square arcminutes; `bands` are up to four whose counts and colour are shown.
     """
-    figure = _figure(15.0, 7.6)
+    figure = figure_of(15.0, 7.6)
     axes = figure.subplots(2, 4).ravel()
     edges = np.arange(14, 32.1, 0.5)
     for band in bands[:4]:
@@ -130,12 +130,12 @@ def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float
     some = galaxies["n_knots"] > 0
     axes[7].hist(galaxies.loc[some, "n_knots"], np.arange(0, 33, 1), histtype="step")
     axes[7].set(xlabel="knots", title=f"Knots: {some.mean():.1%} of galaxies have them")
-    return _png(figure)
+    return png(figure)
 
 
 def exposure_maps(region: Region, footprints: dict[str, np.ndarray]) -> bytes:
     """Return how many exposures (by band: corners (n, 4, 2), degrees) points of a region have: map and histogram."""
-    figure = _figure(3.6 * len(footprints), 6.2)
+    figure = figure_of(3.6 * len(footprints), 6.2)
     axes = figure.subplots(2, len(footprints), squeeze=False)
     ra = region.ra_min + region.width * (np.arange(150) + 0.5) / 150
     dec = region.dec_min + (region.dec_max - region.dec_min) * (np.arange(150) + 0.5) / 150
@@ -150,7 +150,7 @@ def exposure_maps(region: Region, footprints: dict[str, np.ndarray]) -> bytes:
         bins = np.arange(counts.max() + 2) - 0.5
         axes[1, column].hist(counts.ravel(), bins, weights=weight.ravel() / weight.sum())
         axes[1, column].set(xlabel="exposures", ylabel="share of the area" if column == 0 else "")
-    return _png(figure)
+    return png(figure)
 
 
 def magnitude_histograms(
@@ -158,7 +158,7 @@ def magnitude_histograms(
 ) -> bytes:
     """Return histograms of true and measured magnitudes with lines at the depths, a panel a band."""
     bands = list(true)
-    figure = _figure(14, 2.9 * -(-len(bands) // 5))
+    figure = figure_of(14, 2.9 * -(-len(bands) // 5))
     edges = np.arange(16, 31.01, 0.5)
     for position, band in enumerate(bands):
         axes = figure.add_subplot(-(-len(bands) // 5), 5, position + 1)
@@ -171,14 +171,14 @@ def magnitude_histograms(
         axes.set_title(band, fontsize=10)
         axes.set_xlabel("AB mag")
         axes.legend(fontsize=7)
-    return _png(figure)
+    return png(figure)
 
 
 def colour_histograms(colours: dict[str, tuple[np.ndarray, np.ndarray]]) -> bytes:
     """Return histograms of true and measured colours, a panel a pair of bands."""
     columns = max(1, min(4, len(colours)))
     rows = max(1, -(-len(colours) // columns))
-    figure = _figure(3.6 * columns, 2.7 * rows)
+    figure = figure_of(3.6 * columns, 2.7 * rows)
     edges = np.arange(-1.5, 3.01, 0.1)
     for position, (name, (true, measured)) in enumerate(colours.items()):
         axes = figure.add_subplot(rows, columns, position + 1)
@@ -188,7 +188,7 @@ def colour_histograms(colours: dict[str, tuple[np.ndarray, np.ndarray]]) -> byte
         axes.set_xlabel("AB mag")
         if position == 0:
             axes.legend(fontsize=8)
-    return _png(figure)
+    return png(figure)
 
 
 def residuals(tables: dict[str, pd.DataFrame]) -> bytes:
@@ -196,7 +196,7 @@ def residuals(tables: dict[str, pd.DataFrame]) -> bytes:
 
     `tables` are those of `romandask.validation.residuals`; bins of fewer than five objects are not shown.
     """
-    figure = _figure(6.5 * len(tables), 8.4)
+    figure = figure_of(6.5 * len(tables), 8.4)
     panels = (
         ("bias", "scatter", "measured less true, mag", (-0.6, 0.6)),
         ("pull", "pull_scatter", "pull", (-4, 4)),
@@ -216,12 +216,12 @@ def residuals(tables: dict[str, pd.DataFrame]) -> bytes:
             axes.set_xlabel(f"{survey}, true AB mag")
             if row == 0 and len(shown):
                 axes.legend(fontsize=8, ncols=3)
-    return _png(figure)
+    return png(figure)
 
 
 def size_magnitude(objects: dict[str, pd.DataFrame], bands: dict[str, str]) -> bytes:
     """Return the half-light radius against magnitude for each survey; point-like objects in colour."""
-    figure = _figure(6 * len(objects), 4.2)
+    figure = figure_of(6 * len(objects), 4.2)
     for position, (survey, frame) in enumerate(objects.items()):
         axes = figure.add_subplot(1, len(objects), position + 1)
         magnitude = ab_magnitude(frame[f"{bands[survey]}_kronFlux"])
@@ -233,12 +233,12 @@ def size_magnitude(objects: dict[str, pd.DataFrame], bands: dict[str, str]) -> b
         axes.set_xlabel(f"{survey} {bands[survey]}, Kron AB mag")
         axes.set_ylabel("half-light radius, arcsec")
         axes.legend(fontsize=8)
-    return _png(figure)
+    return png(figure)
 
 
 def completeness(tables: dict[str, pd.DataFrame], matched: dict[str, pd.DataFrame], bands: dict[str, str]) -> bytes:
     """Return completeness and purity by magnitude, and measured less true magnitudes, of each survey."""
-    figure = _figure(6 * len(tables), 6.4)
+    figure = figure_of(6 * len(tables), 6.4)
     for position, (survey, table) in enumerate(tables.items()):
         axes = figure.add_subplot(2, len(tables), position + 1)
         for name, colour in (("completeness", "tab:blue"), ("purity", "tab:orange")):
@@ -255,13 +255,13 @@ def completeness(tables: dict[str, pd.DataFrame], matched: dict[str, pd.DataFram
         axes.set_ylim(-1.5, 1.5)
         axes.set_xlabel(f"true {bands[survey]}, AB mag")
         axes.set_ylabel("measured less true, mag")
-    return _png(figure)
+    return png(figure)
 
 
 def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
     """Return the blend matrix: log number of groups by Roman (rows) and Rubin (columns) objects."""
     shown = counts[counts.index <= 9][[c for c in counts.columns if c <= 6]]
-    figure = _figure(1.6 + 0.8 * max(3, shown.shape[1]), 1.4 + 0.5 * max(3, shown.shape[0]))
+    figure = figure_of(1.6 + 0.8 * max(3, shown.shape[1]), 1.4 + 0.5 * max(3, shown.shape[0]))
     axes = figure.add_subplot()
     values = shown.to_numpy(float)
     axes.imshow(np.log10(values + 1), origin="lower", cmap="Blues", aspect="auto")
@@ -275,7 +275,7 @@ def blend_matrix(counts: pd.DataFrame, length: float) -> bytes:
     axes.set_xlabel("Rubin objects in the group")
     axes.set_ylabel("Roman objects")
     axes.set_title(f"groups at {length:g} arcsec", fontsize=10)
-    return _png(figure)
+    return png(figure)
 
 
 def blend_fraction(tables: dict[float, pd.DataFrame], chance: dict[float, pd.DataFrame]) -> bytes:
@@ -283,7 +283,7 @@ def blend_fraction(tables: dict[float, pd.DataFrame], chance: dict[float, pd.Dat
 
     `chance` are the same tables of a moved sky: of them the share with any Roman object is shown.
     """
-    figure = _figure(6.5, 4)
+    figure = figure_of(6.5, 4)
     axes = figure.add_subplot()
     for number, (length, table) in enumerate(tables.items()):
         good = table[table["rubin_objects"] > 0]
@@ -296,12 +296,12 @@ def blend_fraction(tables: dict[float, pd.DataFrame], chance: dict[float, pd.Dat
     axes.set_ylabel("unrecognised blends / Rubin objects")
     axes.set_ylim(0, 1)
     axes.legend()
-    return _png(figure)
+    return png(figure)
 
 
 def blend_distributions(table: pd.DataFrame) -> bytes:
     """Return distributions of colour and size of blends and of single objects (statistics/distributions)."""
-    figure = _figure(10, 3.4)
+    figure = figure_of(10, 3.4)
     labels = {"colour": "g - F184, AB mag", "size": "half-light radius in Rubin, arcsec"}
     for position, (quantity, label) in enumerate(labels.items()):
         axes = figure.add_subplot(1, 2, position + 1)
@@ -312,12 +312,12 @@ def blend_distributions(table: pd.DataFrame) -> bytes:
             axes.stairs(rows[column] / max(total, 1), edges, color=colour, label=f"{column}: {total}")
         axes.set_xlabel(label)
         axes.legend(fontsize=8)
-    return _png(figure)
+    return png(figure)
 
 
 def shear(tables: dict[str, pd.DataFrame]) -> bytes:
     """Return xi+ and xi- against separation with theory, by survey (catalogs/shear.yaml)."""
-    figure = _figure(10, 3.8)
+    figure = figure_of(10, 3.8)
     for position, kind in enumerate(("xip", "xim")):
         axes = figure.add_subplot(1, 2, position + 1)
         for number, (survey, table) in enumerate(tables.items()):
@@ -330,22 +330,24 @@ def shear(tables: dict[str, pd.DataFrame]) -> bytes:
         axes.set_xlabel("arcmin")
         axes.set_ylabel(f"separation $\\xi_{'+' if kind == 'xip' else '-'}$, $10^{{-4}}$ arcmin")
         axes.legend(fontsize=8)
-    return _png(figure)
+    return png(figure)
 
 
-def _in_sigma(plane: np.ndarray) -> np.ndarray:
+def in_sigma(plane: np.ndarray) -> np.ndarray:
     """Return an image in units of its own noise (median absolute deviation)."""
     sigma = 1.4826 * np.median(np.abs(plane - np.median(plane)))
     return plane / (sigma if sigma > 0 else 1.0)
 
 
-def _figure(width: float, height: float) -> Figure:
+def figure_of(width: float, height: float) -> Figure:
+    """Return an empty figure of some size, inches."""
     figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()

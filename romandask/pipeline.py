@@ -15,6 +15,7 @@ from romandask.instruments.rubin import Rubin, RubinSettings
 from romandask.model.config import (
     CoaddSettings,
     DetectionSettings,
+    DifferenceSettings,
     LensingSettings,
     MatchSettings,
     RegionSettings,
@@ -46,6 +47,7 @@ class Pipeline(Section):
     detections: DetectionSettings = DetectionSettings()
     matches: MatchSettings = MatchSettings()
     lensing: LensingSettings = LensingSettings()
+    differences: DifferenceSettings = DifferenceSettings()
     run: RunSettings = RunSettings()
 
     def instruments(self) -> dict[str, Instrument]:

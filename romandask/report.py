@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +13,10 @@ from matplotlib.figure import Figure
 from romandask import pictures
 from romandask.effects import differences
 from romandask.flow import Planned, run_figures, stored_versions
+from romandask.joint_report import blends, difference_images, field
 from romandask.lensing import significance
 from romandask.model.spectra import ab_magnitude
+from romandask.page import image_of, table_of
 from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.survey import Survey
@@ -57,7 +58,9 @@ def write_report(survey: Survey) -> Path:
         _sky(survey, objects, busiest),
         _detector(survey),
         _measurements(survey, objects),
-        _blends(survey),
+        blends(survey),
+        field(survey, objects, busiest),
+        difference_images(survey),
         _lensing(survey),
         _figures_of_the_run(survey),
     ]
@@ -116,7 +119,7 @@ def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
                 "objects / arcmin2": f"{len(frame) / region.area:.1f}",
             }
         )
-    return text + _table(pd.DataFrame(rows))
+    return text + table_of(pd.DataFrame(rows))
 
 
 def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
@@ -134,11 +137,11 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
     return (
         "<h2>The same sky</h2>"
-        + _image(
+        + image_of(
             pictures.colour_pair(pairs, circled),
             f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
         )
-        + _image(pictures.maps(layers), "Weight and number of exposures of the tile.")
+        + image_of(pictures.maps(layers), "Weight and number of exposures of the tile.")
     )
 
 
@@ -150,7 +153,7 @@ def _detector(survey: Survey) -> str:
     # one that has an afterglow, if there is one
     index = next((row for row in range(len(table)) if len(before(table, row))), 0)
     name = product.names[index]
-    return "<h2>The detectors</h2>" + _image(
+    return "<h2>The detectors</h2>" + image_of(
         pictures.effects({found.effect: found.image for found in differences(product, index)}),
         f"What each effect of the SCA does around the brightest star of exposure {name}: with it less without it, all "
         "else and the random numbers the same, in electrons.",
@@ -164,14 +167,14 @@ def _inputs(survey: Survey) -> str:
     bands = tuple(survey.bandpasses)
     # blue and red of each survey
     shown = tuple(dict.fromkeys(band for band in ("r", "i", "H158", bands[0], bands[-1]) if band in bands))[:4]
-    text = "<h2>The true universe and where it is looked at</h2>" + _image(
+    text = "<h2>The true universe and where it is looked at</h2>" + image_of(
         pictures.input_distributions(galaxies, stars, survey.region.area, shown),
         f"{len(galaxies)} galaxies and {len(stars)} stars of the region, by component.",
     )
     for name, instrument in survey.instruments.items():
         table = survey.pointings(name)
         footprints = {band: corners_of(table[table["band"] == band]) for band in instrument.bands}
-        text += _image(pictures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
+        text += image_of(pictures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
     return text
 
 
@@ -198,29 +201,29 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     return (
         "<h2>Measurements</h2>"
         + _beside_the_paper(survey, objects, joined, depth)
-        + _image(
+        + image_of(
             pictures.magnitude_histograms(true, measured, depth),
             "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
             "5-sigma depths of point sources.",
         )
         + (
-            _image(
+            image_of(
                 pictures.colour_histograms(colours),
                 "Colours of objects with a signal to noise above 10 in both bands: true (grey) and measured.",
             )
             if colours
             else ""
         )
-        + _image(
+        + image_of(
             pictures.size_magnitude(objects, middle),
             "Size and magnitude; point sources form the locus at the PSF's size.",
         )
-        + _image(
+        + image_of(
             pictures.residuals(found),
             "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
             "their errors (pulls), median and scatter; and the share of objects that are flagged.",
         )
-        + _image(
+        + image_of(
             pictures.completeness(
                 {name: survey.completeness(name) for name in survey.instruments},
                 matched,
@@ -255,72 +258,7 @@ def _beside_the_paper(
                     f"{paper:.1f}" if paper else "",
                 )
             )
-    return _table(pd.DataFrame(rows, columns=["", "here", "Troxel et al. 2023"]))
-
-
-def _blends(survey: Survey) -> str:
-    if not {"roman", "rubin"} <= set(survey.instruments):
-        return ""
-    lengths, statistics = survey.pipeline.matches.linking_lengths, survey.statistics
-    rows = {name: len(survey.sample_product(name).column("objectId")) for name in survey.instruments}
-    limits = [survey.limit_product(name).load(0).iloc[0] for name in survey.instruments]
-    cuts = ", ".join(f"{row['band']} < {row['limit']:.2f}" for row in limits if np.isfinite(row["limit"]))
-    kind = "unflagged, with a true counterpart" if survey.pipeline.matches.sample == "clean" else "all objects"
-    text = (
-        f"<h2>Blends</h2><p>Friends of friends over {rows['roman']} objects of Roman and {rows['rubin']} of Rubin: "
-        f"{kind}{', ' + html.escape(cuts) if cuts else ''}. An unrecognised blend is alone of Rubin in a group with "
-        "two or more objects of Roman.</p>"
-    )
-    for length in lengths:
-        counts = statistics.blends(length)
-        if counts.size:
-            text += _image(
-                pictures.blend_matrix(counts, length),
-                f"Numbers of groups at a linking length of {length:g} arcsec. Rows: Roman, columns: Rubin.",
-            )
-    tables = {length: statistics.unrecognised(length) for length in lengths}
-    chance = {length: statistics.chance(length) for length in lengths}
-    return (
-        text
-        + _table(pd.DataFrame([_blend_row(survey, length, tables[length], chance[length]) for length in lengths]))
-        + "<p>Troxel et al. (2023): 20 to 30% of Rubin's detections are unrecognised blends; 12% of the groups have a "
-        "Rubin object and none of Roman, 95% of those within a magnitude of the limit. A blend is real where its Roman "
-        "objects are two or more true ones, the second with a twentieth of the light or more. By chance: the share of "
-        "Rubin objects that have a Roman one, or two, where all of Rubin's are moved.</p>"
-        + _image(
-            pictures.blend_fraction(tables, chance),
-            "Unrecognised blends against i magnitude; errors are binomial. Dotted: objects with any Roman object by "
-            "chance.",
-        )
-        + _image(
-            pictures.blend_distributions(statistics.distributions(lengths[0])),
-            f"Rubin's objects alone of their survey in a group ({lengths[0]:g} arcsec), with one Roman object and with "
-            "more: colour to the brightest of them, and size.",
-        )
-    )
-
-
-def _blend_row(survey: Survey, length: float, table: pd.DataFrame, chance: pd.DataFrame) -> dict[str, str]:
-    """Return the figures of one linking length."""
-    total, moved = table.sum(numeric_only=True), chance.sum(numeric_only=True)
-    objects, blends = int(total["rubin_objects"]), int(total["blends"])
-    counts = survey.statistics.blends(length)
-    alone = int(counts.loc[0].drop(0, errors="ignore").sum()) if 0 in counts.index else 0
-    faintest = float(survey.limit_product("rubin").load(0)["limit"].iloc[0])
-    near = table.loc[table["i_mag_high"] > faintest - 1, "alone"].sum()
-
-    def share(part: float, whole: float) -> str:
-        return f"{part / whole:.1%}" if whole else ""
-
-    return {
-        "linking length": f"{length:g} arcsec",
-        "unrecognised blends": f"{blends} of {objects}: {share(blends, objects)}",
-        "of them real": share(total["real"], blends),
-        "groups with Rubin alone": share(alone, counts.to_numpy().sum()),
-        "within 1 mag of the limit": share(near, total["alone"]) if np.isfinite(faintest) else "",
-        "one or more by chance": share(moved["with_roman"], moved["rubin_objects"]),
-        "two or more by chance": share(moved["blends"], moved["rubin_objects"]),
-    }
+    return table_of(pd.DataFrame(rows, columns=["", "here", "Troxel et al. 2023"]))
 
 
 def _lensing(survey: Survey) -> str:
@@ -338,9 +276,9 @@ def _lensing(survey: Survey) -> str:
     ]  # fmt: skip
     return (
         "<h2>Cosmic shear</h2>"
-        + _table(pd.DataFrame(rows))
+        + table_of(pd.DataFrame(rows))
         + "<p>Troxel et al. (2023), the whole survey: 69 galaxies a square arcminute, 0.247, signal to noise 47.</p>"
-        + _image(
+        + image_of(
             pictures.shear(tables),
             "Two-point functions of the true shapes of detected galaxies, with the errors of the Gaussian covariance; "
             "lines: what the input cosmology makes of the sample's redshifts.",
@@ -365,7 +303,9 @@ def _figures_of_the_run(survey: Survey) -> str:
     disk = sum(path.stat().st_size for path in survey.store.root.rglob("*") if path.is_file())
     versions = ", ".join(f"{name} {number}" for name, number in stored_versions(survey.store).items())
     return (
-        "<h2>The run</h2>" + _table(shown) + f"<p>On disk: {disk / 1e6:.0f} MB. Made with {html.escape(versions)}.</p>"
+        "<h2>The run</h2>"
+        + table_of(shown)
+        + f"<p>On disk: {disk / 1e6:.0f} MB. Made with {html.escape(versions)}.</p>"
     )
 
 
@@ -373,14 +313,3 @@ def _busiest_tile(survey: Survey, objects: dict[str, pd.DataFrame]) -> int:
     names = [tile.name for tile in survey.tiles]
     counts = sum(frame["tile"].value_counts().reindex(names, fill_value=0) for frame in objects.values())
     return names.index(counts.idxmax())
-
-
-def _image(png: bytes, caption: str) -> str:
-    data = base64.b64encode(png).decode()
-    text = html.escape(caption)
-    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
-
-
-def _table(frame: pd.DataFrame) -> str:
-    return frame.to_html(index=False, border=0)

@@ -15,8 +15,9 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import LazyUnits, Unit
 
-ALLOWED = FLAGS["deblended"]
-"""Flags that clean objects may have: of Source Extractor's 1 and 2, which Troxel et al. (2023) allow, sep has one."""
+ALLOWED = FLAGS["deblended"] | FLAGS["kron_nonpositive"]
+"""Flags that clean objects may have: of Source Extractor's 1 and 2, which Troxel et al. (2023) allow, sep has one; that
+an aperture is the least one Source Extractor does not tell."""
 EDGES = np.arange(16.0, 30.001, 0.1)
 """Bins of magnitude in which objects are counted for their limit."""
 
@@ -47,7 +48,7 @@ def samples(
     objects, matched, limit : objects, truth_match and limits of the survey
     bands, band : all of the survey, and the reference band, in which the limit holds
 
-    A clean object has no flag but that of deblending, a counterpart in the truth, and is not fainter than the limit,
+    A clean object has no flag but those allowed, a counterpart in the truth, and is not fainter than the limit,
     dereddened (Troxel et al. 2023, section 6).
     """
     state = {"sample": settings.sample, "bands": bands, "band": band, "flags": ALLOWED}

@@ -129,6 +129,21 @@ class Survey(SurveyProducts):
         """Return the lazy maps of detected objects (tile, y, x): `segmentation`, the last 24 bits of objectId."""
         return self.detection_product(survey).dataset
 
+    def differences(self) -> xr.Dataset:
+        """Return the lazy differences (tile, y, x) of Rubin's tiles and Roman's: difference, template, rms, nJy.
+
+        Raises
+        ------
+        UserError
+            If the survey does not have both bands (`differences.template` and `differences.science`).
+        """
+        return self.difference_product.dataset
+
+    def difference_residuals(self) -> pd.DataFrame:
+        """Return what is left of bright objects in the differences (schema: catalogs/residuals.yaml)."""
+        product = self.difference_product
+        return pd.concat([product.load(k, ("residuals",))["residuals"] for k in range(len(product.units))])
+
     def truth_match(self, survey: str) -> dd.DataFrame:
         """Return the lazy true counterparts of a survey's objects (schema: catalogs/truth_match.yaml)."""
         return self.truth_match_product(survey).frame
@@ -175,7 +190,7 @@ class Survey(SurveyProducts):
         Of a region too small for the shortest separation it has no rows. `romandask.lensing.significance` is the signal
         to noise of such a table.
         """
-        return self.shear_product(survey).all_rows()
+        return self.lensing_products(survey).shear.all_rows()
 
     def matches(self, linking_length: float | None = None) -> dd.DataFrame:
         """Return the lazy friends-of-friends groups of the samples of all surveys (schema: catalogs/groups.yaml).

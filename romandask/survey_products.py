@@ -12,10 +12,11 @@ import pandas as pd
 from romandask.calibration import calibrations
 from romandask.coadds import coadds
 from romandask.detections import detections, objects
+from romandask.differences import differences
 from romandask.exposures import exposures
 from romandask.incoming import incoming, open_sources
 from romandask.instruments.exposure import Instrument
-from romandask.lensing import shear
+from romandask.lensing import Lensing, lensing
 from romandask.matches import SHIFT, Matches, matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
@@ -190,11 +191,29 @@ class SurveyProducts:
         bands = instrument.bands, reference_band(instrument)
         return self._once("samples", survey, lambda: samples(*tables, settings, *bands))
 
-    def shear_product(self, survey: str) -> TableProduct:
-        """The two-point functions of the shapes of a survey's sample."""
-        sample, settings = self.sample_product(survey), self.pipeline
-        galaxies, lensing = self.truth_catalogs.galaxies, settings.lensing
-        return self._once("shear", survey, lambda: shear(sample, galaxies, lensing, self.region, settings.seed))
+    def lensing_products(self, survey: str) -> Lensing:
+        """The stages of the two-point functions of the shapes of a survey's sample."""
+        sample, galaxies = self.sample_product(survey), self.truth_catalogs.galaxies
+        return self._once(
+            "lensing", survey, lambda: lensing(sample, galaxies, self.pipeline.lensing, self.region, self.store)
+        )
+
+    @property
+    def differs(self) -> bool:
+        """True where the survey has both bands of the difference images."""
+        settings = self.pipeline.differences
+        bands = {band for instrument in self.instruments.values() for band in instrument.bands}
+        return {settings.template, settings.science} <= bands
+
+    @property
+    def difference_product(self) -> ImageProduct:
+        """The differences of Rubin's tiles and Roman's."""
+        settings = self.pipeline.differences
+        if not self.differs:
+            raise UserError(f"difference images need {settings.template} of Roman and {settings.science} of Rubin")
+        tiles = self.coadd_product("roman"), self.coadd_product("rubin")
+        found = self.detection_product("rubin")
+        return self._once("differences", "rubin", lambda: differences(*tiles, found, settings))
 
     @property
     def match_products(self) -> Matches:

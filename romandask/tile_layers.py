@@ -90,7 +90,7 @@ class TileBands:
                 noise[part], _ = weighted_mean([one["noise"] for one in parts], weights, spreads)
         error, mask = errors(total, rms_of(noise, total))
         psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
-        return Layer(image, error, mask, noise_ratios(noise, error, mask), psf)
+        return Layer(image, error, mask, noise_ratios(noise, error, mask), psf, psf_scatter(noise, psf, error))
 
 
 def _blocks(shape: tuple[int, int]) -> Iterator[Window]:

@@ -45,7 +45,7 @@ def command(*arguments: str, cwd: Path | None = None, timeout: float = 1800) -> 
 MINI = (
     "roman.bands=[H158]", "rubin.bands=[i]", "roman.pointings.dithers={H158: [2]}", "rubin.pointings.visits={i: 8}",
     "coadds.pixels=600", "coadds.overlap=60", "region.ra=[53.0151, 53.024]", "region.dec=[-40.008, -40.0006]",
-    "truth.galaxies=150", "render.n_waves=3",
+    "truth.galaxies=150", "render.n_waves=3", "roman.psf_degree=0",
 )  # fmt: skip
 """Overrides that make the tiny pipeline a few seconds long."""
 

@@ -81,7 +81,7 @@ def test_source_extractor_finds_the_same_objects_as_bright(noisy, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     theirs = np.loadtxt(tmp_path / "found.cat")
-    found, segments = detect(noisy, 2.5, 5, 48, 0.05)
+    found, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
     tree = cKDTree(np.c_[found.x, found.y])
     # ours is under a window, or, where that wanders off, the barycentre
     queries = [tree.query(theirs[:, columns] - 1) for columns in ([0, 1], [2, 3])]
@@ -120,7 +120,7 @@ def test_quoted_errors_are_the_scatter_on_correlated_noise():
 
 
 def test_the_map_has_the_objects_and_an_overflow_is_flagged(noisy, monkeypatch):
-    found, segments = detect(noisy, 2.5, 5, 48, 0.05)
+    found, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
     ix, iy = np.rint(found.x).astype(int), np.rint(found.y).astype(int)
     assert (segments[iy, ix] == found.label).mean() > 0.9
     assert set(np.unique(segments)) == {0, *found.label}
@@ -132,7 +132,7 @@ def test_the_map_has_the_objects_and_an_overflow_is_flagged(noisy, monkeypatch):
         return whole(*arguments, deblend_cont=deblend_cont, **named)
 
     monkeypatch.setattr(sep, "extract", crowded)
-    flagged, _ = detect(noisy, 2.5, 5, 48, 0.05)
+    flagged, _ = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
     assert (flagged.flags & NOT_DEBLENDED > 0).all()
     assert FLAGS["not_deblended"] == NOT_DEBLENDED
     assert 0.7 * len(found.x) < len(flagged.x) <= len(found.x)

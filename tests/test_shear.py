@@ -1,18 +1,22 @@
 """Cosmic shear against pyccl, GalSim, Monte Carlo and analytic limits."""
 
+from dataclasses import replace
+
 import galsim
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyccl
 import pytest
+import treecorr
 from scipy.special import jv
 
 from romandask.kernels.shear import ELL, bin_means, convergence_power, correlations, covariance, shapes
-from romandask.lensing import MeasureShear, significance, two_point
+from romandask.lensing import MeasureShapes, lensing, patches, separations, significance, two_point
 from romandask.model.config import LensingSettings
 from romandask.model.cosmology import Cosmology
 from romandask.model.sky import Region
+from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
@@ -123,7 +127,7 @@ def test_shapes_without_lensing_have_the_errors_of_their_noise_and_a_shear_its_s
         "redshift": np.full(n, 0.05), "g1": own.real, "g2": own.imag,
     })  # fmt: skip
     settings = LensingSettings(max_separation=40, bins=8, patches=30)
-    table = two_point(frame, settings, region, 1)
+    table = two_point(frame, settings, region)
     assert table["high"].iloc[-1] == pytest.approx(40)
     assert table["sigma"].iloc[0] == pytest.approx(0.25, rel=0.02)
     for kind in ("xip", "xim"):
@@ -131,13 +135,13 @@ def test_shapes_without_lensing_have_the_errors_of_their_noise_and_a_shear_its_s
         ratio = table[f"{kind}_jackknife"] / table[f"{kind}_error"]
         assert ratio.median() == pytest.approx(1, abs=0.25)
     assert significance(table) < 8
-    moved = two_point(frame.assign(g1=frame["g1"] + shear), settings, region, 1)
+    moved = two_point(frame.assign(g1=frame["g1"] + shear), settings, region)
     assert (moved["xip"] - shear**2).abs().max() < 6e-4
 
 
 def test_a_region_smaller_than_the_shortest_separation_has_no_bins():
     frame = pd.DataFrame({name: np.zeros(50) for name in ("ra", "dec", "redshift", "g1", "g2")})
-    table = two_point(frame, LensingSettings(), Region(10.0, 10.05, 0.0, 0.05), 1)
+    table = two_point(frame, LensingSettings(), Region(10.0, 10.05, 0.0, 0.05))
     assert len(table) == 0
     assert significance(table) == 0
 
@@ -153,14 +157,16 @@ def test_the_sample_is_the_galaxies_that_objects_have_as_counterparts(small):
     where = pd.concat([some, some[:5], every.iloc[[1]], some[:1]])["_healpix_29"].to_numpy()
     order = small.truth.galaxies.order
     parts = [
-        pd.DataFrame({"truth_id": ids, "star": star})[where >> 2 * (29 - order) == cell].reset_index(drop=True)
+        pd.DataFrame({"truth_id": ids, "star": star, "_healpix_29": where})[
+            where >> 2 * (29 - order) == cell
+        ].reset_index(drop=True)
         for cell in cells
     ]
-    columns = pa.schema([("truth_id", pa.int64()), ("star", pa.bool_())])
+    columns = pa.schema([("truth_id", pa.int64()), ("star", pa.bool_()), ("_healpix_29", pa.int64())])
     units = tuple(Unit(str(cell), cell) for cell in cells)
     sample = TableProduct("samples/roman", units, lambda k: parts[k], columns, cells, order)
-    maker = MeasureShear(sample, small.truth.galaxies, LensingSettings(), small.region, 1)
-    found = pd.concat([maker.shapes(k) for k in range(len(units))])
+    maker = MeasureShapes(sample, small.truth.galaxies)
+    found = pd.concat([maker(k) for k in range(len(units))])
     assert sorted(found["galaxy_id"]) == sorted(some["galaxy_id"])
     first = some.iloc[0]
     axis = "disk" if np.isfinite(first["disk_magnorm"]) else "bulge"
@@ -170,3 +176,66 @@ def test_the_sample_is_the_galaxies_that_objects_have_as_counterparts(small):
     )  # fmt: skip
     row = found.set_index("galaxy_id").loc[first["galaxy_id"]]
     assert row["g1"] + 1j * row["g2"] == pytest.approx(expected)
+
+
+def random_shapes(region: Region, count: int) -> pd.DataFrame:
+    """Return galaxies with shapes that are alike near one another."""
+    random = np.random.default_rng(3)
+    ra = (region.ra_min + random.uniform(0, region.width, count)) % 360
+    dec = np.degrees(np.arcsin(random.uniform(*np.sin(np.radians([region.dec_min, region.dec_max])), count)))
+    wave = 0.05 * np.sin(20 * np.radians(dec) * 60)
+    return pd.DataFrame({
+        "ra": ra, "dec": dec, "redshift": random.uniform(0.2, 2, count),
+        "g1": wave + random.normal(0, 0.2, count), "g2": random.normal(0, 0.2, count),
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("ra", [(52.0, 54.0), (359.2, 1.1)])
+def test_sums_over_patches_are_treecorrs_of_the_whole_with_its_jackknife(ra):
+    region = Region(*ra, -41.0, -39.5)
+    frame, settings = random_shapes(region, 20_000), LensingSettings(max_separation=60, bins=6, patches=12)
+    table, edges = two_point(frame, settings, region), separations(settings, region)
+    patch = np.full(len(frame), -1)
+    for number, box in enumerate(patches(region, 12)):
+        inside = box.contains(frame["ra"], frame["dec"])
+        assert (patch[inside] == -1).all()
+        patch[inside] = number
+    assert patch.min() == 0
+    assert np.ptp(np.bincount(patch)) < 0.15 * len(frame) / 12
+    columns = {name: frame[name].to_numpy() for name in ("ra", "dec", "g1", "g2")}
+    catalog = treecorr.Catalog(**columns, ra_units="deg", dec_units="deg", patch=patch)
+    whole = treecorr.GGCorrelation(
+        min_sep=edges[0], max_sep=edges[-1], nbins=len(edges) - 1, sep_units="arcmin", var_method="jackknife",
+        cross_patch_weight="match",
+    )  # fmt: skip
+    whole.process(catalog)
+    np.testing.assert_allclose(table["xip"], whole.xip, rtol=1e-9)
+    np.testing.assert_allclose(table["xim"], whole.xim, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(table["pairs"], whole.npairs)
+    np.testing.assert_allclose(table["separation"], whole.meanr, rtol=1e-9)
+    errors = np.sqrt(np.diag(whole.cov))
+    np.testing.assert_allclose(table["xip_jackknife"], errors[: len(table)], rtol=1e-9)
+    np.testing.assert_allclose(table["xim_jackknife"], errors[len(table) :], rtol=1e-9)
+
+
+def test_stages_over_partitions_make_what_is_made_in_memory():
+    """Shapes that lie in HEALPix partitions, counted patch by patch."""
+    region = Region(52.0, 53.0, -40.6, -40.0)
+    frame = with_spatial_index(random_shapes(region, 3000)).assign(galaxy_id=np.arange(3000))
+    settings, order = LensingSettings(max_separation=15, bins=4, patches=6), 6
+    cells = tuple(int(cell) for cell in region.cells(order))
+    units = tuple(Unit(str(cell), cell) for cell in cells)
+    where = frame["_healpix_29"].to_numpy() >> 2 * (29 - order)
+    columns = pa.schema([("truth_id", pa.int64()), ("star", pa.bool_()), ("_healpix_29", pa.int64())])
+    every = frame.assign(truth_id=frame["galaxy_id"], star=False)
+    parts = [every[where == cell].reset_index(drop=True) for cell in cells]
+    sample = TableProduct("samples/roman", units, lambda k: parts[k], columns, cells, order)
+    stages = lensing(sample, sample, settings, region)
+    made = replace(stages.shapes, make=lambda k: parts[k])
+    pairs = replace(stages.pairs, make=replace(stages.pairs.make, shapes=made))
+    found = replace(stages.shear.make, shapes=made, pairs=pairs)(0)
+    expected = two_point(frame, settings, region)
+    assert len(expected) == 4
+    assert found["galaxies"].iloc[0] == 3000
+    for name in ("separation", "pairs", "xip", "xim", "xip_error", "xip_jackknife", "sigma"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-8)

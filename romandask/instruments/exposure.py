@@ -78,8 +78,8 @@ class Instrument(Protocol):
     detector: Detector
     aperture: float
     """Radius of aperture photometry, arcsec: it holds most of the light of a point source."""
-    detection: Literal["median", "mean"]
-    """How bands are combined to the detection image."""
+    detection: Literal["median", "peaks"]
+    """median: Source Extractor on the median of bands; peaks: those of their weighted mean, smoothed with its PSF."""
     detection_bands: tuple[str, ...] | None
     """Bands that enter it; None for all."""
 

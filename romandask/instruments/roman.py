@@ -114,7 +114,7 @@ class Roman:
     field_radius: float = 0.6
     knot_smoothing: float = KNOT_SMOOTHING
     aperture: float = 0.5
-    detection: Literal["median", "mean"] = "median"
+    detection: Literal["median", "peaks"] = "median"
     detection_bands: tuple[str, ...] | None = None
     coadd: Literal["drizzle"] = "drizzle"
     detector: Detector = Detector(saturation=1e5, read_noise=galsim.roman.read_noise)

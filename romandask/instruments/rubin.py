@@ -102,7 +102,7 @@ class Rubin:
     field_radius: float = 2.06
     knot_smoothing: float = 0.0
     aperture: float = 1.5
-    detection: Literal["median", "mean"] = "mean"
+    detection: Literal["median", "peaks"] = "peaks"
     detection_bands: tuple[str, ...] | None = None
     detector: Detector = Detector(saturation=1e5, read_noise=9.0)
     seed: int = 0

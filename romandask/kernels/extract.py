@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sep
@@ -10,9 +10,13 @@ from scipy import ndimage
 
 from romandask.kernels.apertures import blendedness, kron_radii, sums
 from romandask.kernels.layer import TRIALS, Layer, at
+from romandask.kernels.peaks import find_peaks
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
 """Kron aperture: this many Kron radii, and at least this many semi-axes (PHOT_AUTOPARAMS of Source Extractor)."""
+REACH, PEAK_REACH = 6.0, 3.5
+"""Semi-axes within which the Kron radius is measured: Source Extractor's, of isophotes; and of the larger ones of a
+smoothed image, beyond which are a faint object's neighbours and noise."""
 NOT_DEBLENDED, NO_DATA, SATURATED_CORE = 256, 512, 1024
 FLAGS = {
     "deblended": sep.OBJ_MERGED,
@@ -58,13 +62,15 @@ class Found:
     flags: np.ndarray
 
 
-def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast: float) -> tuple[Found, np.ndarray]:
+def detect(
+    layer: Layer, threshold: float, min_area: int, levels: int, contrast: float, min_snr: float
+) -> tuple[Found, np.ndarray]:  # fmt: skip
     """Return the objects of a detection image, with Source Extractor's meaning of the settings, and their map (int32).
 
-    An object too crowded to deblend is measured without deblending and flagged; it never ends the run.
+    Kept are those whose Kron flux has the least signal to noise. An object too crowded to deblend is measured without
+    deblending and flagged; it never ends the run.
     """
-    sep.set_extract_pixstack(2_000_000)
-    sep.set_sub_object_limit(16_384)
+    _make_room()
     image, error, mask = layer.image, layer.error, layer.mask
     error[mask] = 1.0
     # smoothed, but with the threshold in units of a pixel's own noise, as Source Extractor has it
@@ -81,12 +87,50 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
         found, segments = sep.extract(image, threshold, deblend_nthresh=levels, deblend_cont=1.0, **options)
         extra = NOT_DEBLENDED
     error[mask] = 0.0
+    objects = _measured(layer, found, segments)
+    kept = select(objects, objects.snr >= min_snr)
+    return replace(kept, flags=kept.flags | extra), segments
+
+
+def detect_peaks(layer: Layer, threshold: float, min_area: int, min_snr: float) -> tuple[Found, np.ndarray]:
+    """Return the objects of a detection image that are peaks of it, smoothed with its PSF, and their map (int32).
+
+    Objects that touch are flagged as deblended; `snr` is that of a point source at the peak.
+    """
+    _make_room()
+    peaks = find_peaks(layer, threshold, min_area, min_snr)
+    if not len(peaks.snr):
+        kinds = [*((name, float) for name in ("x", "y", "a", "b", "theta", "x2", "y2", "xy")), ("flag", int)]
+        return _measured(layer, np.zeros(0, kinds), peaks.segments), peaks.segments
+    layer.error[layer.mask] = 1.0
+    # smoothed as little as Source Extractor does for its moments
+    found, _ = sep.extract(
+        layer.image, threshold, err=layer.error, mask=layer.mask, minarea=1, filter_type="conv", clean=False,
+        segmentation_map=peaks.segments,
+    )  # fmt: skip
+    layer.error[layer.mask] = 0.0
+    objects = _measured(layer, found, peaks.segments, PEAK_REACH)
+    flags = objects.flags | np.where(peaks.touching, sep.OBJ_MERGED, 0).astype(np.int32)
+    return replace(objects, snr=peaks.snr.astype(float), flags=flags), peaks.segments
+
+
+def _make_room() -> None:
+    sep.set_extract_pixstack(2_000_000)
+    sep.set_sub_object_limit(16_384)
+
+
+def _measured(layer: Layer, found: np.ndarray, segments: np.ndarray, reach: float = REACH) -> Found:
+    """Return what is measured of the objects that sep has found, in the order of their numbers in the map.
+
+    The radius of light is measured within `reach` semi-axes.
+    """
+    image, mask = layer.image, layer.mask
     x, y, a, b, theta = (found[name].astype(float) for name in ("x", "y", "a", "b", "theta"))
     # a line of pixels has no width; half a pixel keeps apertures defined
-    a, b = np.maximum(a, 0.3), np.maximum(b, 0.3)
-    theta = np.clip(theta, -np.pi / 2, np.pi / 2)
+    a, b = np.maximum(np.nan_to_num(a), 0.3), np.maximum(np.nan_to_num(b), 0.3)
+    theta = np.clip(np.nan_to_num(theta), -np.pi / 2, np.pi / 2)
     label = np.arange(1, len(x) + 1, dtype=np.int64)
-    radius = kron_radii(image, mask, segments, label, x, y, a, b, theta, 6.0)
+    radius = kron_radii(image, mask, segments, label, x, y, a, b, theta, reach)
     dark = np.where(np.isfinite(radius), 0, sep.APER_NONPOSITIVE)
     radius = np.maximum(KRON_FACTOR * np.nan_to_num(radius), KRON_MIN)
     flux, flux_error, flag = ellipse_flux(layer, segments, label, x, y, a, b, theta, radius)
@@ -100,8 +144,8 @@ def detect(layer: Layer, threshold: float, min_area: int, levels: int, contrast:
     xw, yw = _windowed(image, mask, x, y, half)
     return Found(
         label, xw, yw, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr, blended,
-        (found["flag"] | dark | flag | half_flag).astype(np.int32) | extra,
-    ), segments  # fmt: skip
+        (found["flag"] | dark | flag | half_flag).astype(np.int32),
+    )  # fmt: skip
 
 
 def select(found: Found, keep: np.ndarray) -> Found:

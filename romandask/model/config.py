@@ -125,15 +125,17 @@ class CoaddSettings(Section):
 
 
 class DetectionSettings(Section):
-    """Source Extractor's settings (Troxel et al. 2023, section 4.5)."""
+    """Source Extractor's settings (Troxel et al. 2023, section 4.5); Rubin's peaks need the first two and `min_snr`."""
 
-    threshold: float = Field(2.5, gt=0, description="detection threshold, sigma of a pixel")
+    threshold: float = Field(2.5, gt=0, description="of objects' pixels: sigma of one; in Rubin's PSF-smoothed image")
     min_area: int = Field(5, ge=1, description="least number of connected pixels")
     deblend_levels: int = Field(48, ge=1)
     deblend_contrast: float = Field(0.05, ge=0)
     match_radius: float = Field(1.0, gt=0, le=10, description="of an object's true counterpart, arcsec")
     summary_magnitude: float = Field(28.0, description="true objects fainter than this (H158, i) are not summarised")
-    min_snr: float = Field(5.0, ge=0, description="least signal to noise in the detection image")
+    min_snr: float = Field(
+        5.0, ge=0, description="least signal to noise in the detection image: of the Kron flux; of Rubin's, of the peak"
+    )
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the object tables' partitions")
 
 
@@ -148,6 +150,14 @@ class MatchSettings(Section):
         None, description="faintest magnitude by reference band (H158, i); where counts fall to 80% if not given"
     )
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
+
+
+class DifferenceSettings(Section):
+    """Difference images: Rubin's tiles less Roman's, where the survey has both bands."""
+
+    template: Literal["Y106", "J129", "H158", "F184"] = Field("Y106", description="Roman's band")
+    science: Literal["u", "g", "r", "i", "z", "y"] = Field("y", description="Rubin's band, from which it is taken away")
+    min_snr: float = Field(20.0, gt=0, description="of objects by which both are matched, and whose residuals are told")
 
 
 class LensingSettings(Section):

@@ -45,7 +45,7 @@ def main(side: float | None) -> None:
         f"{region.area / 3600:.2f} square degrees, made in {time.perf_counter() - start:.0f} s"
     )
     start = time.perf_counter()
-    table = two_point(frame, LensingSettings(), region, SEED)
+    table = two_point(frame, LensingSettings(), region)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"xi, jackknife and covariance: {time.perf_counter() - start:.0f} s on one core, peak {peak:.2f} GiB")
     columns = ["separation", "xip", "xip_theory", "xip_error", "xip_jackknife", "xim", "xim_theory", "xim_error"]

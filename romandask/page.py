@@ -1,0 +1,21 @@
+"""Parts of an HTML page: pictures that lie in it, and tables."""
+
+from __future__ import annotations
+
+import base64
+import html
+
+import pandas as pd
+
+
+def image_of(png: bytes, caption: str) -> str:
+    """Return a picture with its caption."""
+    data = base64.b64encode(png).decode()
+    text = html.escape(caption)
+    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+
+
+def table_of(frame: pd.DataFrame) -> str:
+    """Return a table."""
+    return frame.to_html(index=False, border=0)

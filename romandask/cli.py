@@ -19,7 +19,7 @@ import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
-from romandask import flow  # noqa: E402
+from romandask import flow, verification  # noqa: E402
 from romandask.calibration import check_files, make_files  # noqa: E402
 from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth  # noqa: E402
 from romandask.instruments.roman_focal_plane import SCAS  # noqa: E402
@@ -145,6 +145,30 @@ def status(store: StoreArgument) -> None:
         known = units >= 0
         table.add_row(name, str(units) if known else "?", str(done), str(units - done) if known else "?", str(failed))
     Console().print(table)
+
+
+@app.command()
+def verify(
+    store: StoreArgument,
+    only: Annotated[str | None, typer.Option("--only", help="A stage, for example coadds/roman.")] = None,
+    forget: Annotated[
+        bool, typer.Option("--forget", help="Remove the records of what is damaged: the next run makes it anew.")
+    ] = False,
+) -> None:
+    """Read every stored byte and compare it with what the manifest says was written."""
+    survey, units, damaged = open_survey(store), 0, 0
+    for found in verification.verify(survey, only):
+        units, damaged = units + found.units, damaged + len(found.damaged)
+        for name, why in found.damaged:
+            print(f"damaged: {found.stage}/{name}: {why}")
+        if forget and found.damaged:
+            verification.forget(survey, found)
+    if damaged:
+        print(
+            f"{damaged} damaged: " + ("run again, they are made anew" if forget else "verify --forget, then run again")
+        )
+        raise typer.Exit(1)
+    print(f"{store}: {units} units are as they were written")
 
 
 @app.command()

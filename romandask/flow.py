@@ -18,6 +18,7 @@ from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
 from romandask.runtime.manifest import digest, read_record
 from romandask.runtime.progress import Reporter
+from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
 from romandask.runtime.store import MARGIN, Store, write_bytes, write_json
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.work import Task
@@ -234,6 +235,7 @@ def _begin(pipeline: Pipeline, store: Store) -> Survey:
     """Store the resolved settings and the packages' versions, and return the survey."""
     write_bytes(store.pipeline, pipeline.to_yaml().encode())
     write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
+    seal(store, "store", [store.pipeline, store.root / "versions.json"])
     return Survey(pipeline, store)
 
 
@@ -243,6 +245,7 @@ def _make_stage(
     _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
     if stage.name == "truth/galaxies":
         write_spectra(survey.truth_catalogs, store)
+        seal(store, "truth/seds", sorted(store.images("truth/seds").rglob("*")))
 
 
 def _run_stage(
@@ -254,6 +257,7 @@ def _run_stage(
     _drop_strays(product, store)
     made = 0
     if tasks:
+        unseal(store, stage.name)
         product.prepare(store)
         # a unit that is made again reads its upstream from the store, never its own former self
         with reporter.stage(stage.name, len(tasks)) as meter:
@@ -268,6 +272,11 @@ def _run_stage(
     summary.made[stage.name] = made
     if stage.position is not None and (made or not (store.catalog(product.stage) / "hats.properties").exists()):
         write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
+    if made or not sealed(store, stage.name):
+        if isinstance(product, ImageProduct):
+            seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
+        elif stage.position is not None:
+            seal(store, stage.name, catalog_files(store, stage.name))
 
 
 def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
@@ -351,7 +360,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
 def run_figures(store: Store) -> list[dict]:
     """Return, a stage, units, seconds of work, bytes, rows and the largest memory of a worker, from the manifest."""
     rows = []
-    for folder in sorted((store.root / "manifest").glob("*/*")):
+    for folder in sorted(path for path in (store.root / "manifest").glob("*/*") if path.is_dir()):
         stage = f"{folder.parent.name}/{folder.name}"
         records = [record for path in store.records(stage) if (record := read_record(store, stage, path.stem))]
         if records:

@@ -216,7 +216,7 @@ class Survey(SurveyProducts):
         place = self.store.root if self.store else "not stored"
         lines = [f"Survey {self.pipeline.name} ({place})"]
         if self.store:
-            for folder in sorted((self.store.root / "manifest").glob("*/*")):
+            for folder in sorted(path for path in (self.store.root / "manifest").glob("*/*") if path.is_dir()):
                 stage = f"{folder.parent.name}/{folder.name}"
                 paths = self.store.records(stage)
                 records = [record for path in paths if (record := read_record(self.store, stage, path.stem))]

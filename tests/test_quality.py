@@ -13,7 +13,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "romandask"
 LAYERS = [
     {"cli"},
-    {"report", "export"},
+    {"report", "export", "verification"},
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},

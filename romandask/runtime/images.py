@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import dask
@@ -16,7 +17,7 @@ import pyarrow as pa
 import xarray as xr
 import zarr
 
-from romandask.runtime.manifest import Digest, digest, read_record
+from romandask.runtime.manifest import digest, read_record
 from romandask.runtime.store import (
     Store,
     Variable,
@@ -30,6 +31,7 @@ from romandask.runtime.store import (
 from romandask.runtime.tables import conform, to_frame
 from romandask.runtime.units import Made, Unit, names_of
 
+NOTHING: Mapping[str, bytes] = MappingProxyType({})
 Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
 """By name: axes, values, attributes."""
 
@@ -124,17 +126,28 @@ class ImageProduct:
         if self.stream is not None:
             return self._written(self.stream(index), index, store)
         arrays = self.make(index)
-        tables = [
-            write_parquet(table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name))
+        tables = {
+            name: write_parquet(
+                table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name)
+            )
             for name, kind in self.tables.items()
-        ]
+        }
         # each is let go once it is written
-        return self._written(((v.name, arrays.pop(v.name)) for v in self.variables), index, store, *tables)
+        return self._written(((v.name, arrays.pop(v.name)) for v in self.variables), index, store, tables)
 
-    def _written(self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, *tables: bytes) -> Made:
+    def verify(self, index: int, store: Store) -> str:
+        """Return the hash of what is stored of a unit: that of its record, where every byte is as it was written."""
+        read = replace(self, store=store).reader(index)
+        parts = {variable.name: digest(read(variable.name, ())) for variable in self.variables}
+        beside = {name: table_beside(store, self.stage, name, self.names[index]) for name in self.tables}
+        return digest(parts | {name: digest(path.read_bytes()) for name, path in beside.items()})
+
+    def _written(
+        self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, tables: Mapping[str, bytes] = NOTHING
+    ) -> Made:
         """Write the arrays of a unit, one after another."""
         variables = {variable.name: variable for variable in self.variables}
-        state, size, rows = Digest(), 0, 0
+        parts, size, rows = {name: digest(content) for name, content in tables.items()}, 0, 0
         group = zarr.open_group(store.images(self.stage), mode="r+")
         place = self._place(index)
         for name, array in arrays:
@@ -144,15 +157,14 @@ class ImageProduct:
                     f"{self.stage} {self.names[index]}: {variable.name} has shape {array.shape}, expected "
                     f"{variable.shape}, or values that are not finite"
                 )
-            write_array(_array(group, variable.name), place, array.astype(variable.dtype, copy=False))
-            state.add(array)
+            array = array.astype(variable.dtype, copy=False)
+            write_array(_array(group, variable.name), place, array)
+            parts[name] = digest(array)
             size, rows = size + array.nbytes, max(rows, array.size)
             del array
         if variables:
             raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
-        for table in tables:
-            state.add(table)
-        return Made(state.value(), size, rows)
+        return Made(digest(parts), size, rows)
 
     def _place(self, index: int) -> tuple[int, ...]:
         """Return the indices of a unit along the axes of units."""

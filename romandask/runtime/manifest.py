@@ -33,16 +33,19 @@ class Record:
 
 
 def read_record(store: Store, stage: str, unit: str) -> Record | None:
-    """Return the record of a unit; None where there is none or where it cannot be read."""
+    """Return the record of a unit; None where there is none, or where it cannot be read or is damaged."""
     try:
-        return Record(**json.loads(store.record(stage, unit).read_text()))
-    except (OSError, ValueError, TypeError):
+        content = json.loads(store.record(stage, unit).read_text())
+        check = content.pop("check")
+        return Record(**content) if check == digest(content) else None
+    except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
 def write_record(store: Store, record: Record) -> None:
-    """Write a record, atomically."""
-    write_json(store.record(record.stage, record.unit), asdict(record))
+    """Write a record, atomically, with a hash of itself: one that is damaged is none."""
+    content = asdict(record)
+    write_json(store.record(record.stage, record.unit), {**content, "check": digest(content)})
 
 
 class Digest:

@@ -1,0 +1,96 @@
+"""Verification: every stored byte against what the manifest says was written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from romandask.flow import stages
+from romandask.runtime.images import ImageProduct
+from romandask.runtime.manifest import read_record
+from romandask.runtime.sealed import broken, unseal
+from romandask.runtime.store import Store
+from romandask.runtime.tables import TableProduct
+from romandask.survey import Survey
+
+BESIDE = ("truth/seds", "store")
+"""What is stored beside the units of stages: the library of spectra, and settings and versions."""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What was found of one stage."""
+
+    stage: str
+    units: int
+    """With a record."""
+    damaged: tuple[tuple[str, str], ...]
+    """Units, and files beside them, that are not as they were written, each with what was found."""
+
+
+def verify(survey: Survey, only: str | None = None) -> Iterator[Verified]:
+    """Yield, a stage at a time, what is stored and what of it is not as it was written. Nothing is changed.
+
+    Parameters
+    ----------
+    only : a stage; None for all
+    """
+    store = survey.store
+    assert store is not None
+    for stage in stages(survey):
+        if only is not None and stage.name != only:
+            continue
+        paths = store.records(stage.name)
+        if not paths:
+            continue
+        product, found = stage.product(survey), []
+        numbers = {name: index for index, name in enumerate(product.names)}
+        for path in paths:
+            why = _damage(product, store, numbers, path)
+            if why is not None:
+                found.append((path.stem, why))
+        yield Verified(stage.name, len(paths), tuple(found + broken(store, stage.name)))
+    for name in BESIDE:
+        if only in (None, name):
+            yield Verified(name, 0, tuple(broken(store, name)))
+
+
+def forget(survey: Survey, found: Verified) -> None:
+    """Remove the records of what is damaged in a stage, so that the next run makes it anew.
+
+    Where files beside an image product's units are damaged, what the arrays are cannot be told for sure any more: all
+    its units are forgotten.
+    """
+    store = survey.store
+    assert store is not None
+    beside = {name for name, _ in broken(store, found.stage)}
+    for name, _ in found.damaged:
+        if name not in beside:
+            store.record(found.stage, name).unlink(missing_ok=True)
+    if not beside:
+        return
+    unseal(store, found.stage)
+    for name in beside:
+        (store.root / name).unlink(missing_ok=True)
+    if store.images(found.stage).exists():
+        shutil.rmtree(store.images(found.stage))
+        for path in store.records(found.stage):
+            path.unlink()
+    (store.catalog(found.stage) / "hats.properties").unlink(missing_ok=True)
+
+
+def _damage(product: ImageProduct | TableProduct, store: Store, numbers: dict[str, int], path: Path) -> str | None:
+    """Return what is wrong with a unit; None where nothing is."""
+    record = read_record(store, product.stage, path.stem)
+    if record is None:
+        return f"{path}: the record is damaged"
+    if path.stem not in numbers:
+        return "the survey has no such unit any more"
+    try:
+        output = product.verify(numbers[path.stem], store)
+    except Exception as error:
+        # whatever a decoder makes of damaged bytes
+        return f"cannot be read ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})"
+    return None if output == record.output else "not what was written"

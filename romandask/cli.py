@@ -19,7 +19,7 @@ import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
-from romandask import flow, verification  # noqa: E402
+from romandask import flow, stages, verification  # noqa: E402
 from romandask.calibration import check_files, make_files  # noqa: E402
 from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth  # noqa: E402
 from romandask.instruments.roman_focal_plane import SCAS  # noqa: E402
@@ -73,7 +73,7 @@ def plan(
 ) -> None:
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
-    rows = flow.plan(Survey(settings))
+    rows = stages.plan(Survey(settings))
     table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
@@ -109,19 +109,36 @@ def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
 
 @app.command()
 def run(
-    pipeline: Source, store: Place, overrides: Overrides = None, workers: Workers = None, scheduler: Scheduler = None
+    pipeline: Source,
+    store: Place,
+    overrides: Overrides = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="A stage alone, coadds or coadds/roman; may be repeated.")
+    ] = None,
+    start: Annotated[str | None, typer.Option("--from", help="This stage and those after it.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say which units would be made and why, and make none.")
+    ] = False,
+    explain: Annotated[bool, typer.Option("--explain", help="Say why units are made, then make them.")] = False,
 ) -> None:
     """Make and store everything that is missing, then the report. The same command resumes."""
     settings = load_pipeline(pipeline, overrides)
     reporter = Reporter(Console())
-    flow.plan(Survey(settings))
-    place = Store(store.resolve())
+    stages.plan(Survey(settings))
+    place, chosen = Store(store.resolve()), stages.Chosen(tuple(only or ()), start)
+    if dry_run or explain:
+        _explain(Survey(settings, place), chosen, reporter)
+    if dry_run:
+        return
+    chosen.of(stages.stages(Survey(settings)))
     place.prepare()
     start = time.monotonic()
     count = settings.run.workers if workers is None else workers
     with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
         reporter.say(f"{settings.name}: {execution.description}")
-        summary = flow.run(settings, place, execution, reporter)
+        summary = flow.run(settings, place, execution, reporter, chosen)
     made, kept = sum(summary.made.values()), sum(summary.kept.values())
     if made == 0 and not summary.failed:
         reporter.say(f"nothing to do: all {kept} units of {store} are done")
@@ -133,8 +150,18 @@ def run(
         reporter.say(f"the reasons are in {store}/manifest/<stage>/<unit>.failed; the same command tries again")
         raise typer.Exit(1)
     page = place.report / "index.html"
+    if only or start:
+        return
     if made or not page.exists():
         reporter.say(f"report: {write_report(open_survey(store))}")
+
+
+def _explain(survey: Survey, chosen: stages.Chosen, reporter: Reporter) -> None:
+    for row in flow.explain(survey, chosen):
+        if row.made or row.reasons:
+            reasons = ", ".join(f"{count} {why}" for why, count in row.reasons.items())
+            reporter.say(f"{row.stage:22s} make {row.made}, keep {row.kept}: {reasons}")
+    reporter.say("every other unit is kept")
 
 
 @app.command()

@@ -52,6 +52,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
     names = np.array(exposures.names, object)
     values = table[[name for name in EXPOSURE_COLUMNS if name != "band"]].to_numpy(float)
     shared = {**settings.model_dump(), "instrument": instrument.name, "seed": render.seed}
+    shared["psf"] = instrument.psf_settings
     if drawn:
         shared |= render.render.model_dump()
     elif drizzled:

@@ -205,6 +205,7 @@ def exposures(
         "instrument": instrument.name,
         "n_waves": render.n_waves,
         "knot_smoothing": instrument.knot_smoothing,
+        "psf": instrument.psf_settings,
     }
     every = exposures_of(table)
     readout: ScaReadout | CcdReadout | None = None
@@ -214,7 +215,7 @@ def exposures(
         readout = ScaReadout(instrument, calibration, seed)
     elif isinstance(instrument, Rubin):
         readout = CcdReadout(instrument, seed)
-        common |= instrument.settings.model_dump(include={"atmosphere", "outer_scale", "sensor", "cosmic_rays"})
+        common |= instrument.settings.model_dump(include={"sensor", "cosmic_rays"})
     names = [exposure.name for exposure in every]
     corners = corners_of(table)
 

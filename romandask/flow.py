@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
-import numpy as np
-
 from romandask.incoming import source_rows
-from romandask.model.errors import UserError
 from romandask.pipeline import Pipeline
 from romandask.runtime.cluster import Runner
-from romandask.runtime.hats import margin, write_catalog_files
+from romandask.runtime.hats import write_catalog_files
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
-from romandask.runtime.manifest import digest, read_record
+from romandask.runtime.manifest import Record, digest, read_record
 from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
-from romandask.runtime.store import MARGIN, Store, write_bytes, write_json
-from romandask.runtime.tables import TableProduct
+from romandask.runtime.store import Store, write_bytes, write_json
+from romandask.runtime.units import Unit
 from romandask.runtime.work import Task
+from romandask.stages import Chosen, Product, Stage, stages
 from romandask.survey import Survey
 from romandask.truth import write_spectra
 
-Product = ImageProduct | TableProduct
-INTERPRETER = 420 << 20
-"""Resident memory of a worker before it makes anything, bytes."""
 PACKAGES = (
     "romandask",
     "astropy",
@@ -49,27 +45,14 @@ PACKAGES = (
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage: the product that it stores."""
-
-    name: str
-    product: Callable[[Survey], Product]
-    position: tuple[str, str] | None = None
-    """Columns of right ascension and declination where the product is a HATS catalog."""
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A row of the plan."""
+class Explained:
+    """What a run would do in one stage."""
 
     stage: str
-    units: int
-    bytes: int
-    """Uncompressed size of the images; 0 where it depends on what is found."""
-    memory: int
-    """Peak of a worker, bytes."""
-    hours: float
-    """Of one core, as measured on a laptop."""
+    made: int
+    kept: int
+    reasons: dict[str, int]
+    """Units that would be made, by why."""
 
 
 @dataclass
@@ -82,130 +65,38 @@ class Summary:
     """stage/unit of units that were set aside, and of those that wait for them."""
 
 
-_SETTING = {
-    "coadds": "lower coadds.pixels",
-    "detections": "lower coadds.pixels",
-    "truth/structure": "lower truth.nside",
-    "truth": "raise truth.order",
-    "objects": "raise detections.order",
-    "differences": "lower coadds.pixels",
-    "matches": "raise matches.order",
-    "chance": "raise matches.order",
-    "samples": "raise detections.order",
-    "exposures": "lower render.largest",
-    "truth_index": "lower render.largest",
-}
-"""What makes the units of a stage smaller."""
+def run(
+    pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter, chosen: Chosen | None = None
+) -> Summary:  # fmt: skip
+    """Make and store, in order, what is missing or no longer what the pipeline asks for.
 
-
-def stages(survey: Survey) -> list[Stage]:
-    """Return the stages of a survey in the order in which they run."""
-    names = list(survey.instruments)
-    found = [_first(survey)]
-    found += _with_margin("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec"))
-    found += _with_margin("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec"))
-    found.append(Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine))
-    found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
-    if survey.pipeline.calibration() is not None:
-        found.append(Stage("calibration/roman", lambda s: s.calibration_product))
-    found += [
-        Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
-        for name, instrument in survey.instruments.items()
-        if instrument.coadd != "draw"
-    ]
-    found += [
-        Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
-        for name, instrument in survey.instruments.items()
-        if instrument.coadd != "draw"
-    ]
-    for kind in ("coadd", "detection"):
-        found += [
-            Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
-            for name in names
-        ]
-    for kind in ("truth_match", "truth_summary", "zero_points"):
-        found += [
-            Stage(f"{kind}/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
-            for name in names
-        ]
-    for name in names:
-        found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
-    for name in names:
-        found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
-        sample = f"samples/{name}"
-        found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
-    if survey.differs:
-        found.append(Stage("differences/rubin", lambda s: s.difference_product))
-    for part, stage in (("shapes", "shapes"), ("pairs", "shear_pairs"), ("shear", "shear")):
-        found += [
-            Stage(f"{stage}/{name}", lambda s, part=part, name=name: getattr(s.lensing_products(name), part))
-            for name in names
-        ]
-    if {"roman", "rubin"} <= set(names):
-        for kind, products in (("matches", "match_products"), ("chance", "chance_products")):
-            found += [
-                Stage(f"{kind}/{part}", lambda s, products=products, part=part: getattr(getattr(s, products), part))
-                for part in ("local", "crossing", "merged")
-            ]
-            groups = f"{kind}/groups"
-            found += _with_margin(groups, lambda s, p=products: getattr(s, p).groups, ("coord_ra", "coord_dec"))
-        found += [
-            Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
-            for part in ("blends", "unrecognised", "distributions", "chance")
-        ]
-    return found
-
-
-def _first(survey: Survey) -> Stage:
-    if survey.pipeline.truth.source == "generate":
-        return Stage("truth/structure", lambda s: s.truth_catalogs.structure)
-    return Stage("truth/incoming", lambda s: s.incoming_product)
-
-
-def _with_margin(name: str, product: Callable[[Survey], TableProduct], position: tuple[str, str]) -> list[Stage]:
-    """Return the stages of a HATS collection: the catalog, then its margin."""
-    return [
-        Stage(name, product, position),  # type: ignore[arg-type]
-        Stage(name + MARGIN, lambda s: margin(product(s)), position),
-    ]
-
-
-def plan(survey: Survey) -> list[Planned]:
-    """Return units, bytes and peak memory of every stage, making nothing but the pointings.
-
-    Raises
-    ------
-    UserError
-        Where a unit does not fit the memory of a worker, or an input is not what it should be.
+    Parameters
+    ----------
+    chosen : stages; None for all. A unit of theirs whose inputs are not stored waits, and is told of.
     """
-    limit = survey.pipeline.run.memory_limit
-    rows = []
-    for stage in stages(survey):
-        product = stage.product(survey)
-        memory = product.bytes_per_unit + INTERPRETER
-        if memory > limit * 2**30 and product.units:
-            setting = _SETTING.get(stage.name, _SETTING.get(stage.name.split("/")[0], "the size of the survey"))
-            raise UserError(
-                f"{stage.name} {product.names[0]} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
-                f"{setting}, or raise run.memory_limit"
-            )
-        size = 0
-        if isinstance(product, ImageProduct):
-            one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in product.variables)
-            size = one * len(product.units)
-        hours = len(product.units) * product.seconds_per_unit / 3600
-        rows.append(Planned(stage.name, len(product.units), size, memory, hours))
-    return rows
-
-
-def run(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) -> Summary:
-    """Make and store, in order, what is missing or no longer what the pipeline asks for."""
     summary = Summary()
     with locked(store.root):
         survey = _begin(pipeline, store)
-        for stage in stages(survey):
+        for stage in (chosen or Chosen()).of(stages(survey)):
             _make_stage(stage, survey, store, runner, reporter, summary)
     return summary
+
+
+def explain(survey: Survey, chosen: Chosen | None = None) -> list[Explained]:
+    """Return, a stage, which units a run would make and why, making nothing.
+
+    What depends on a unit that is to be made is counted with it, though it may turn out the same.
+    """
+    store, coming = survey.store, set[tuple[str, str]]()
+    assert store is not None
+    rows = []
+    for stage in (chosen or Chosen()).of(stages(survey)):
+        product = stage.product(survey)
+        tasks, kept, blocked = _tasks(product, store, coming)
+        coming |= {(product.stage, product.names[task.index]) for task in tasks}
+        reasons = Counter(task.why for task in tasks) + Counter({"an input is missing": len(blocked)})
+        rows.append(Explained(stage.name, len(tasks), kept, dict(reasons.most_common())))
+    return rows
 
 
 def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter) -> dict[str, int]:
@@ -279,9 +170,19 @@ def _run_stage(
             seal(store, stage.name, catalog_files(store, stage.name))
 
 
-def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
-    """Return the units to make, how many are done, and those that wait for an input that failed."""
-    outputs: dict[tuple[str, str], str | None] = {}
+def _tasks(
+    product: Product, store: Store, coming: Set[tuple[str, str]] | None = None
+) -> tuple[list[Task], int, list[str]]:
+    """Return the units to make, how many are done, and those that wait for an input that is missing.
+
+    The records of units that are to be made, or cannot be, are removed, but in a plan.
+
+    Parameters
+    ----------
+    coming : in a plan, units of earlier stages that will be made; None in a run
+    """
+    outputs: dict[tuple[str, str], str | None] = dict.fromkeys(coming or (), "to be made")
+    forget = coming is None
 
     def output(source: tuple[str, str]) -> str | None:
         if source not in outputs:
@@ -294,19 +195,20 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
     waiting: dict[str, tuple[str, ...]] = {}
     kept = 0
     for index, unit in enumerate(product.units):
-        upstream = [output(source) for source in unit.inputs]
-        if None in upstream:
+        if any(output(source) is None for source in unit.inputs):
             blocked.append(unit.name)
-            store.record(product.stage, unit.name).unlink(missing_ok=True)
+            if forget:
+                store.record(product.stage, unit.name).unlink(missing_ok=True)
             continue
-        upstream += [output(source) for source in unit.optional]
-        inputs = digest(product.stage, unit.settings, version("romandask"), upstream)
-        record = read_record(store, product.stage, unit.name)
+        parts = _parts(unit, output)
+        inputs, record = digest(product.stage, parts), read_record(store, product.stage, unit.name)
         if record is not None and record.inputs == inputs:
             kept += 1
             continue
-        store.record(product.stage, unit.name).unlink(missing_ok=True)
-        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin)
+        why = _why(store, product.stage, unit.name, record, parts)
+        if forget:
+            store.record(product.stage, unit.name).unlink(missing_ok=True)
+        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts, why)
         waiting[unit.name] = unit.after
     held = _held(waiting, set(blocked))
     chosen = [
@@ -315,6 +217,28 @@ def _tasks(product: Product, store: Store) -> tuple[list[Task], int, list[str]]:
         if name not in held
     ]
     return chosen, kept, blocked + sorted(held)
+
+
+def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
+    """Return what a unit depends on, by name: its settings, the version, and what it reads of each stage."""
+    read: dict[str, list[str | None]] = {}
+    for source in (*unit.inputs, *unit.optional):
+        read.setdefault(source[0], []).append(output(source))
+    return {"settings": digest(unit.settings), "version": version("romandask")} | {
+        stage: digest(found) for stage, found in read.items()
+    }
+
+
+def _why(store: Store, stage: str, name: str, record: Record | None, parts: dict[str, str]) -> str:
+    """Return why a unit is made."""
+    if record is None:
+        return "damaged record" if store.record(stage, name).exists() else "not there"
+    if not record.parts:
+        return "made by an earlier version"
+    changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
+    if changed == ["version"]:
+        return f"made by version {record.parts.get('version')}"
+    return f"changed: {', '.join(changed)}"
 
 
 def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:

@@ -12,13 +12,14 @@ from matplotlib.figure import Figure
 
 from romandask import pictures
 from romandask.effects import differences
-from romandask.flow import Planned, run_figures, stored_versions
+from romandask.flow import run_figures, stored_versions
 from romandask.joint_report import blends, difference_images, field
 from romandask.lensing import significance
 from romandask.model.spectra import ab_magnitude
 from romandask.page import image_of, table_of
 from romandask.pointings import corners_of
 from romandask.readout import before
+from romandask.stages import Planned
 from romandask.survey import Survey
 from romandask.truth_match import reference_band
 from romandask.validation import colours_of, depths, residuals, with_truth

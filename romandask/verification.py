@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from romandask.flow import stages
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import read_record
 from romandask.runtime.sealed import broken, unseal
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
+from romandask.stages import stages
 from romandask.survey import Survey
 
 BESIDE = ("truth/seds", "store")

@@ -17,6 +17,7 @@ LAYERS = [
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},
+    {"stages"},
     {"survey"},
     {"survey_products"},
     {"pipeline", "statistics"},

@@ -126,6 +126,43 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     assert list((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed"))
 
 
+def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
+    def told(*arguments: str) -> str:
+        done = command("run", "tiny", "--store", "s", *MINI, "--dry-run", *arguments, cwd=one_worker.parent)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    before = outputs(one_worker)
+    command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    assert told().strip() == "every other unit is kept"
+    lines = {line.split()[0]: line for line in told("detections.min_snr=8").splitlines() if " make " in line}
+    assert "changed: settings" in lines["detections/roman"]
+    assert "changed: detections/roman" in lines["zero_points/roman"]
+    assert not any(name.startswith(("truth/", "exposures", "coadds")) for name in lines)
+    # whatever an exposure is drawn with makes it again
+    for setting in ("roman.psf_degree=1", "roman.charge_diffusion=0.3", "render.truncation=0.1", "seed=4"):
+        assert any(line.startswith("exposures/roman ") for line in told(setting).splitlines()), setting
+    assert any(line.startswith("coadds/rubin ") for line in told("rubin.atmosphere=von_karman").splitlines())
+    only = told("detections.min_snr=8", "--only", "detections/roman").splitlines()
+    assert len([line for line in only if " make " in line]) == 1
+    assert not any(
+        line.startswith("coadds") for line in told("coadds.pixfrac=0.8", "--from", "detections").splitlines()
+    )
+    assert outputs(one_worker) == before
+    wrong = command("run", "tiny", "--store", "s", *MINI, "--only", "coads", cwd=one_worker.parent)
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("error: stage 'coads': this survey has truth")
+
+
+def test_a_stage_alone_makes_what_its_inputs_allow(tmp_path):
+    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "pointings", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(name.split("/")[0] for name in outputs(tmp_path / "s")) == ["pointings", "pointings"]
+    early = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "coadds/rubin", cwd=tmp_path)
+    assert early.returncode == 1
+    assert "an input is missing" in early.stdout
+
+
 def test_status_and_report_of_a_store(one_worker):
     shown = command("status", str(one_worker))
     assert shown.returncode == 0

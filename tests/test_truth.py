@@ -18,7 +18,7 @@ from hats.loaders import read_hats
 from rich.console import Console
 
 from romandask.export import export_truth
-from romandask.flow import ingest, stages
+from romandask.flow import ingest
 from romandask.instruments.rubin import Rubin, RubinSettings
 from romandask.model.config import TruthSettings
 from romandask.model.errors import UserError
@@ -29,6 +29,7 @@ from romandask.runtime.hats import WIDTH, margin, write_catalog_files
 from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
 from romandask.runtime.work import Task
+from romandask.stages import stages
 from romandask.survey import Survey, open_survey
 from romandask.truth import truth
 

@@ -88,6 +88,10 @@ class Instrument(Protocol):
         """Bands of this pipeline."""
 
     @property
+    def psf_settings(self) -> dict[str, object]:
+        """What PSFs depend on but the exposure: a part of the hash of what is drawn with them."""
+
+    @property
     def coadd(self) -> Literal["drizzle", "warp", "draw"]:
         """How tiles are made: drizzled or warped from exposures, or drawn directly from the cadence."""
 

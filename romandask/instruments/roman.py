@@ -124,6 +124,12 @@ class Roman:
         """Bands of this pipeline."""
         return self.settings.bands
 
+    @property
+    def psf_settings(self) -> dict[str, object]:
+        """How PSFs vary over an SCA, of which stars they are finer, and the diffusion of charge."""
+        settings = self.settings.model_dump(include={"psf_degree", "bright_stars", "charge_diffusion"})
+        return {**settings, "detector": self.settings.detector}
+
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""
         return roman_bandpass(band, self.n_waves)

@@ -114,6 +114,11 @@ class Rubin:
         return self.settings.bands
 
     @property
+    def psf_settings(self) -> dict[str, object]:
+        """Turbulence, and the seed of its patterns."""
+        return self.settings.model_dump(include={"atmosphere", "outer_scale"}) | {"seed": self.seed}
+
+    @property
     def coadd(self) -> Literal["draw", "warp"]:
         """Whether tiles are drawn from the cadence, or made of its exposures."""
         return "draw" if self.settings.mode == "coadd" else "warp"

@@ -30,6 +30,8 @@ class Record:
     peak_bytes: int
     """Largest resident memory of the worker that made it, so far in its life."""
     warnings: list[str] = field(default_factory=list)
+    parts: dict[str, str] = field(default_factory=dict)
+    """What `inputs` is the hash of: settings, version, and the outputs of each stage that is read, by its name."""
 
 
 def read_record(store: Store, stage: str, unit: str) -> Record | None:

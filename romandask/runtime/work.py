@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record, write_record
@@ -24,6 +24,10 @@ class Task:
     cost: float
     kin: str = ""
     """As that of its unit."""
+    parts: dict[str, str] = field(default_factory=dict)
+    """What `inputs` is the hash of, by name."""
+    why: str = ""
+    """It is made."""
     after: tuple[int, ...] = ()
     """Numbers of units of the same stage, made in the same run, that must be there before it."""
 
@@ -46,6 +50,7 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
         rows=made.rows,
         seconds=round(time.perf_counter() - start, 3),
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        parts=task.parts,
         warnings=sorted({f"{item.category.__name__}: {item.message}" for item in caught}),
     )
     write_record(store, record)

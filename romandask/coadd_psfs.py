@@ -37,7 +37,7 @@ class _Middle:
 @lru_cache(maxsize=40)
 def _middle_image(middle: _Middle) -> np.ndarray:
     ny, nx = middle.instrument.shape
-    return psf_image(middle.instrument, middle.exposure, (nx - 1) / 2, (ny - 1) / 2)
+    return psf_image(middle.instrument, middle.exposure, (nx - 1) / 2, (ny - 1) / 2).astype(np.float32)
 
 
 def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:

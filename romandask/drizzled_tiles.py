@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from operator import getitem
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +38,7 @@ class DrizzleTile:
     pixels: int
     render: RenderSettings
 
-    def __call__(self, index: int) -> dict[str, np.ndarray]:
+    def __call__(self, index: int) -> dict[str, Any]:
         """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
         source: RenderExposure = self.exposures.make  # type: ignore[assignment]
         instrument = source.instrument
@@ -54,21 +57,20 @@ class DrizzleTile:
             if parts[number]:
                 psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
         give_back()
-        sums, dq = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac), np.zeros(shape, np.uint8)
+        sums, full = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac), []
         for i, exposure, header, frame, part in zip(members, exposures, headers, frames, parts, strict=True):
             planes: Iterable = []
             if part:
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
                 maps = [pixel_map(frame, target, strip.rows, strip.columns) for strip in part]
-                for onto in maps:
-                    mark_saturated(dq, arrays["dq"], onto)
+                full += [saturated_places(arrays["dq"], onto, shape) for onto in maps]
                 planes = _planes_of(arrays, maps, instrument, exposure, header, source.seed, self.settings.noise)
             sums.add(planes)
         arrays, planes = {}, []
         give_back()
         seconds = np.array([exposure.exptime for exposure in exposures])
         sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])
-        count = sums.count
+        members_of = np.array([len(chosen) for chosen in sums.sets], np.uint16)
         image, *noise = sums.means()
         for plane in (image, *noise):
             plane *= np.float32(scale**2)
@@ -77,8 +79,9 @@ class DrizzleTile:
             "image": image,
             "weight": sums.weight,
             "noise": np.stack(noise) if len(noise) > 1 else noise[0][None],
-            "nimages": count,
-            "dq": dq,
+            # made when they are written: by then the planes before them are let go
+            "nimages": partial(getitem, members_of, sums.set),
+            "dq": partial(marked, np.concatenate([np.zeros(0, np.int32), *full]), shape),
             "set": sums.set,
             "psf": np.tensordot(used / max(used.sum(), 1e-30), psfs, 1).astype(np.float32),
             "input_psf": psfs,
@@ -86,8 +89,8 @@ class DrizzleTile:
         }
 
 
-def mark_saturated(dq: np.ndarray, source: np.ndarray, onto: PixelMap) -> None:
-    """Set, in its place, the bit of a tile's dq plane (uint8) around where pixels of an exposure are saturated.
+def saturated_places(source: np.ndarray, onto: PixelMap, shape: tuple[int, int]) -> np.ndarray:
+    """Return the pixels of a tile (n,), int32 in its flattened image, around where those of an exposure are saturated.
 
     They are left out of the mean, and what is left at a star's core is its fainter part.
 
@@ -98,13 +101,19 @@ def mark_saturated(dq: np.ndarray, source: np.ndarray, onto: PixelMap) -> None:
     """
     rows, columns = np.nonzero(source[onto.rows, onto.columns] & SATURATED)
     if not len(rows):
-        return
+        return np.zeros(0, np.int32)
     x, y = np.rint(onto.at(rows + onto.rows.start, columns + onto.columns.start)).astype(int).T
     # a drop is less than two of the tile's pixels wide
-    for step_y, step_x in np.ndindex(3, 3):
-        v, u = y + step_y - 1, x + step_x - 1
-        inside = (v >= 0) & (u >= 0) & (v < dq.shape[0]) & (u < dq.shape[1])
-        dq[v[inside], u[inside]] |= SATURATED
+    near = np.stack([(y + step_y - 1, x + step_x - 1) for step_y, step_x in np.ndindex(3, 3)], axis=-1)
+    v, u = near[:, (near >= 0).all(axis=0) & (near[0] < shape[0]) & (near[1] < shape[1])]
+    return np.unique(v * shape[1] + u).astype(np.int32)
+
+
+def marked(places: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return a dq plane (uint8) that is saturated at some places (n,) of the flattened image."""
+    dq = np.zeros(shape, np.uint8)
+    dq.ravel()[places] = SATURATED
+    return dq
 
 
 def most_inputs(members: dict[tuple[int, str], np.ndarray]) -> int:

@@ -271,14 +271,15 @@ def _variables(shape: tuple[int, int], readout: ScaReadout | CcdReadout | None) 
         "truth", "float32", shape, ("y", "x"), {"units": "electron", "long_name": "noiseless image of the objects"}
     )
     if isinstance(readout, CcdReadout):
-        return (*readout.variables, truth)
+        image, *others = readout.variables
+        return image, truth, *others
     full = readout is not None
     bits = {**DQ_FLAGS, **FLAGS} if full else DQ_FLAGS
     masks = {"long_name": "data quality", "flag_masks": list(bits.values()), "flag_meanings": " ".join(bits)}
     electrons = {"units": "electron"}
-    image = "calibrated image, sky included" if full else "observed image"
+    said = "calibrated image, sky included" if full else "observed image"
     found = [
-        ("image", "float32" if full else "int32", {**electrons, "long_name": image}),
+        ("image", "float32" if full else "int32", {**electrons, "long_name": said}),
         ("dq", "uint16" if full else "uint8", masks),
     ]
     if full:
@@ -286,7 +287,8 @@ def _variables(shape: tuple[int, int], readout: ScaReadout | CcdReadout | None) 
             ("raw", "uint16", {"units": "DN", "long_name": "what was read"}),
             ("variance", "float32", {"units": "electron2", "long_name": "variance of the image"}),
         ]
-    return (*(Variable(name, kind, shape, ("y", "x"), attributes) for name, kind, attributes in found), truth)
+    image, *others = (Variable(name, kind, shape, ("y", "x"), attributes) for name, kind, attributes in found)
+    return image, truth, *others
 
 
 def empty_variance(

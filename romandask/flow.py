@@ -208,7 +208,7 @@ def _tasks(
         why = _why(store, product.stage, unit.name, record, parts)
         if forget:
             store.record(product.stage, unit.name).unlink(missing_ok=True)
-        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts, why)
+        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
         waiting[unit.name] = unit.after
     held = _held(waiting, set(blocked))
     chosen = [

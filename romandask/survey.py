@@ -59,7 +59,7 @@ class Survey(SurveyProducts):
     def exposures(self, survey: str) -> xr.Dataset:
         """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ...
 
-        With roman.detector: sca also raw and variance, and the image is the calibrated one.
+        Of Rubin, and of Roman with detector: sca, also raw and variance, and the image is the calibrated one.
         """
         return self.exposure_product(survey).dataset
 

@@ -12,7 +12,7 @@ from drizzle.resample import Drizzle
 from scipy import ndimage
 
 from romandask.coadds import coadds
-from romandask.drizzled_tiles import mark_saturated
+from romandask.drizzled_tiles import saturated_places
 from romandask.exposures import RenderExposure, wcs_of
 from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman import Roman, RomanSettings
@@ -81,7 +81,8 @@ def test_tiles_are_marked_where_exposures_are_saturated(small):
     dq[150, 150] = 2
     marked = np.zeros(shape, np.uint8)
     for part in parts:
-        mark_saturated(marked, dq, pixel_map(source, target, part.rows, part.columns))
+        onto = pixel_map(source, target, part.rows, part.columns)
+        marked.ravel()[saturated_places(dq, onto, shape)] = SATURATED
     sums = Sums(shape, 1, 0.7)
     light = ((dq & SATURATED) > 0).astype(np.float32)
     sums.add(

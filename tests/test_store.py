@@ -42,7 +42,7 @@ def test_images_come_back_and_grow_with_their_units(tmp_path):
     assert array.shape == (5, 64, 48)
     np.testing.assert_array_equal(array[1], images(3).make(1)["image"])
     np.testing.assert_array_equal(array[4], images(3).make(4)["image"])
-    assert first.output == digest(images(3).make(1)["image"])
+    assert first.output == digest({"image": digest(images(3).make(1)["image"])})
 
 
 def test_a_unit_is_read_only_when_its_record_says_that_it_is_done(tmp_path):

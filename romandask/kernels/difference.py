@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage, signal
+from scipy import fft, ndimage
 
+from romandask.kernels.convolve import convolve
 from romandask.kernels.pixel_map import PixelMap
 
 WIDTHS = (0.8, 1.6, 3.2)
@@ -76,7 +77,7 @@ def blurred(
         slice(int(max(places[..., k].min() - reach, 0)), int(min(places[..., k].max() + reach, side)))
         for k, side in ((1, shape[0]), (0, shape[1]))
     )
-    part = signal.oaconvolve(read(*window), kernel.astype(np.float32), mode="same")
+    part = convolve(read(*window), kernel.astype(np.float32))
     at = places[..., 1] - window[0].start, places[..., 0] - window[1].start
     return (ndimage.map_coordinates(part, at, order=3, mode="nearest") * area).astype(np.float32)
 
@@ -146,7 +147,7 @@ def _gaussian(sigma: float) -> np.ndarray:
 
 def convolved(image: np.ndarray, kernel: np.ndarray | None) -> np.ndarray:
     """Return an image convolved with a kernel; None for as it is."""
-    return image if kernel is None else signal.oaconvolve(image, kernel.astype(np.float32), mode="same")
+    return image if kernel is None else convolve(image, kernel.astype(np.float32))
 
 
 def match(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy import signal
 
+from romandask.kernels.convolve import convolve
 from romandask.kernels.layer import Layer
 
 KERNEL = 8
@@ -65,8 +65,8 @@ def point_source_snr(layer: Layer) -> np.ndarray:
         return weight
     weight /= scale
     turned = kernel[::-1, ::-1]
-    sums = signal.oaconvolve(layer.image * weight, turned, mode="same")
-    norm = signal.oaconvolve(weight, turned**2, mode="same")
+    sums = convolve(layer.image * weight, turned)
+    norm = convolve(weight, turned**2)
     found = np.zeros(weight.shape, np.float32)
     # of what is mostly beyond the edge nothing is said
     enough = good & (norm > 0.2 * (kernel**2).sum() * weight)

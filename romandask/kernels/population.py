@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
-from scipy.stats import gamma
+from scipy.special import gammainc, gammaincinv
 
 from romandask.kernels.structure import MIN_REDSHIFT, shells
 
@@ -80,7 +80,7 @@ def population(density: float) -> Population:
     counts[0] += cumulative[0] * density / REFERENCE_DENSITY
     middle = (edges[1:] + edges[:-1]) / 2
     limits = np.maximum(shells().edges, MIN_REDSHIFT)
-    share = np.diff(gamma.cdf(limits[None] / redshift_scale(middle)[:, None], 3), axis=1)
+    share = np.diff(gammainc(3, limits[None] / redshift_scale(middle)[:, None]), axis=1)
     every = counts[:, None] * share / share.sum(axis=1, keepdims=True)
     kernel = SATELLITES_A_MAGNITUDE * _STEP * 10 ** (SATELLITE_SLOPE * (np.arange(len(middle)) + 0.25) * _STEP)
     kernel[0] /= 2
@@ -130,7 +130,7 @@ def richness(uniform: np.ndarray) -> np.ndarray:
 def _richness_table() -> tuple[np.ndarray, np.ndarray]:
     # dense where the tail is
     grid = 1 - np.geomspace(1, 1e-6, 4000)
-    values = gamma.ppf(grid, RICHNESS_SHAPE) / RICHNESS_SHAPE
+    values = gammaincinv(RICHNESS_SHAPE, grid) / RICHNESS_SHAPE
     steps = np.diff(grid)
     mean = ((values[1:] + values[:-1]) / 2 * steps).sum() + values[-1] * (1 - grid[-1])
     return grid, values / mean

@@ -44,7 +44,7 @@ class ImageProduct:
     """For example exposures/roman; also its place in the store."""
     units: Sequence[Unit]
     make: Callable[[int], dict[str, Any]]
-    """Makes the arrays of one unit."""
+    """Makes the arrays of one unit; one may be a function of no arguments, which makes it when it is wanted."""
     variables: tuple[Variable, ...]
     axes: tuple[str, ...]
     """Names of the axes over units."""
@@ -93,7 +93,7 @@ class ImageProduct:
             found = {name: to_frame(read_parquet(path)) for name, path in beside.items()}
             return {**{name: read(name, window) for name in wanted}, **found}
         made = self.make(index)
-        return {**{name: made[name][(..., *window)] for name in wanted}, **{name: made[name] for name in tables}}
+        return {**{name: _made(made[name])[(..., *window)] for name in wanted}, **{name: made[name] for name in tables}}
 
     def reader(self, unit: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
         """Return what reads windows of the last axes of arrays of a stored unit: each is opened once."""
@@ -133,7 +133,7 @@ class ImageProduct:
             for name, kind in self.tables.items()
         }
         # each is let go once it is written
-        return self._written(((v.name, arrays.pop(v.name)) for v in self.variables), index, store, tables)
+        return self._written(((v.name, _made(arrays.pop(v.name))) for v in self.variables), index, store, tables)
 
     def verify(self, index: int, store: Store) -> str:
         """Return the hash of what is stored of a unit: that of its record, where every byte is as it was written."""
@@ -201,6 +201,11 @@ class ImageProduct:
             for key, (axes, values, attributes) in self.coordinates().items()
         }
         return xr.Dataset(data, coordinates, self.attributes)
+
+
+def _made(array: np.ndarray | Callable[[], np.ndarray]) -> np.ndarray:
+    """Return an array, or what makes it when it is wanted."""
+    return array() if callable(array) else array
 
 
 def table_beside(store: Store, stage: str, name: str, unit: str) -> Path:

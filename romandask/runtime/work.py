@@ -24,12 +24,12 @@ class Task:
     cost: float
     kin: str = ""
     """As that of its unit."""
+    after: tuple[int, ...] = ()
+    """Numbers of units of the same stage, made in the same run, that must be there before it."""
     parts: dict[str, str] = field(default_factory=dict)
     """What `inputs` is the hash of, by name."""
     why: str = ""
-    """It is made."""
-    after: tuple[int, ...] = ()
-    """Numbers of units of the same stage, made in the same run, that must be there before it."""
+    """The reason for which it is made."""
 
 
 def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *after: Record) -> Record:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import lru_cache
+from functools import lru_cache, wraps
 from tempfile import TemporaryFile
-from typing import Literal
+from threading import RLock
+from typing import Any, Literal
 
 import galsim
 import galsim.roman
@@ -167,8 +168,10 @@ class Roman:
         if not self.settings.psf_degree:
             x, y = _MIDDLE.x - 0.5, _MIDDLE.y - 0.5
         grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.diffusion(exposure.detector)
-        profiles = self.profiles(exposure, x, y)
-        return model(np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles]), grid)
+        with _GALSIM:
+            profiles = self.profiles(exposure, x, y)
+            nodes = np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles])
+        return model(nodes, grid)
 
     def psf_key(self, exposure: Exposure) -> tuple:
         """Return what tells PSFs apart: those of an SCA and band are the same in all exposures."""
@@ -239,11 +242,26 @@ _NEAR = 256
 _MIDDLE = galsim.PositionD(SIDE / 2, SIDE / 2)
 
 
+_GALSIM = RLock()
+
+
+def _one_thread(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that one thread at a time runs: GalSim keeps the pupil of its last PSF for all threads."""
+
+    @wraps(function)
+    def alone(*arguments: Any) -> Any:
+        with _GALSIM:
+            return function(*arguments)
+
+    return alone
+
+
 def _optics(sca: int, band: str, wave: float, pupil_bin: int, place: galsim.PositionD = _MIDDLE) -> galsim.GSObject:
     return galsim.roman.getPSF(sca, band, SCA_pos=place, pupil_bin=pupil_bin, wavelength=wave)
 
 
 @lru_cache(maxsize=128)
+@_one_thread
 def _edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, float]:
     waves, grid = roman_bandpass(band, n_waves).nodes, Grid(_EXTENT // 8, FOLDS[band])
     ends = [sample(_optics(sca, band, wave, 8), galsim.roman.pixel_scale, grid, diffusion) for wave in waves[[0, -1]]]
@@ -251,6 +269,7 @@ def _edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, flo
 
 
 @lru_cache(maxsize=1)
+@_one_thread
 def _psf(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     waves = roman_bandpass(band, n_waves).nodes
     scale = galsim.roman.pixel_scale
@@ -281,10 +300,13 @@ class _WideNodes:
     diffusion: float
 
     def __call__(self) -> Iterator[np.ndarray]:
-        file = _wide_samples(self).file
-        file.seek(0)
-        for _ in self.waves:
-            yield np.fromfile(file, np.complex64, np.prod(self.grid.shape)).reshape(self.grid.shape)
+        file, size = _wide_samples(self).file, int(np.prod(self.grid.shape))
+        for number in range(len(self.waves)):
+            # another thread may read the same file
+            with _GALSIM:
+                file.seek(number * size * np.dtype(np.complex64).itemsize)
+                samples = np.fromfile(file, np.complex64, size)
+            yield samples.reshape(self.grid.shape)
 
 
 class _Samples:
@@ -298,6 +320,7 @@ class _Samples:
 
 
 @lru_cache(maxsize=2)
+@_one_thread
 def _wide_samples(nodes: _WideNodes) -> _Samples:
     """Return the samples of some nodes: long in the making, and large."""
     samples = _Samples()

@@ -203,7 +203,7 @@ class ImageProduct:
         return xr.Dataset(data, coordinates, self.attributes)
 
 
-def _made(array: np.ndarray | Callable[[], np.ndarray]) -> np.ndarray:
+def _made(array: Any) -> Any:
     """Return an array, or what makes it when it is wanted."""
     return array() if callable(array) else array
 

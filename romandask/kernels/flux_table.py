@@ -113,7 +113,7 @@ def _lagrange(at, nodes, out):
         above *= at - nodes[0, k]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _interpolate(table, rows, magnorm, sed, position, own_av, mw_av, own_nodes, coarse_nodes, mw_nodes, out):
     bands = table.shape[3]
     n, m, k = own_nodes.shape[1], coarse_nodes.shape[1], mw_nodes.shape[1] - 1

@@ -221,7 +221,7 @@ def default_first() -> int:
     return int(round(np.log(_rest_wave()[0]) / LOG_STEP))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def after(tau):
     """Return exp(-tau), to six digits wherever light is left: a series of a 64th of it, squared six times.
 
@@ -238,7 +238,7 @@ def after(tau):
     return e
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fade(work, lo, hi, av, ev, a, b, base, share):
     """Multiply cells lo to hi by exp(-tau) of a dust law, tabulated from `base` on, `share` of a cell further."""
     for j in range(lo, hi):
@@ -247,7 +247,7 @@ def _fade(work, lo, hi, av, ev, a, b, base, share):
         work[j] *= after(tau * _TO_TAU)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sums(work, scale, starts, offsets, weights, out):
     for c in range(len(starts)):
         total = 0.0
@@ -256,7 +256,7 @@ def _sums(work, scale, starts, offsets, weights, out):
         out[c] = total * scale
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _through_dust(
     i, work, lo, hi, shift, first, in_av, in_ev, in_a, in_b, in_first, rest, mw_av, mw_ev, mw_a, mw_b,
     starts, offsets, weights, scale, out,
@@ -281,7 +281,7 @@ def _through_dust(
         out[SEEN, i] = out[NO_MILKY_WAY, i]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _library_rates(
     photons, photons_first, index, scale, shift, first, cells, in_av, in_ev, in_a, in_b, in_first, rest,
     mw_av, mw_ev, mw_a, mw_b, starts, offsets, weights, out,
@@ -305,7 +305,7 @@ def _library_rates(
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _tophat_rates(
     flambda, beyond, edges, scale, shift, first, cells, in_av, in_ev, in_a, in_b, in_first, rest,
     mw_av, mw_ev, mw_a, mw_b, starts, offsets, weights, out,

@@ -2,6 +2,8 @@
 
 from importlib.metadata import version as _version
 
+from threadpoolctl import threadpool_limits
+
 from romandask.coadds import coadds
 from romandask.cutouts import cutouts
 from romandask.detections import detections, objects
@@ -19,6 +21,9 @@ from romandask.truth import truth
 from romandask.truth_index import truth_index
 
 __version__ = _version("romandask")
+# with more threads linear algebra rounds its sums otherwise, and pixels would depend on how many cores there are
+threadpool_limits(limits=1, user_api="blas")
+
 __all__ = [
     "Cone",
     "Pipeline",

@@ -134,7 +134,7 @@ def run(
         return
     chosen.of(stages.stages(Survey(settings)))
     place.prepare()
-    start = time.monotonic()
+    began = time.monotonic()
     count = settings.run.workers if workers is None else workers
     with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
         reporter.say(f"{settings.name}: {execution.description}")
@@ -143,7 +143,7 @@ def run(
     if made == 0 and not summary.failed:
         reporter.say(f"nothing to do: all {kept} units of {store} are done")
     else:
-        reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - start:.0f} s")
+        reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - began:.0f} s")
     for name in summary.failed:
         reporter.say(f"failed: {name}")
     if summary.failed:

@@ -1,6 +1,8 @@
 """The code's own rules: linter, types, layers, and prose that names real things."""
 
 import ast
+import json
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from conftest import ROOT
 from romandask.cli import app
 
 PACKAGE = ROOT / "romandask"
+TYPED = [f"romandask/{name}" for name in ("model", "runtime", "formats", "cli.py", "flow.py", "verification.py")]
 LAYERS = [
     {"cli"},
     {"report", "export", "verification"},
@@ -82,6 +85,16 @@ def test_kernels_that_make_images_round_alike_wherever_their_arrays_lie():
         assert "fastmath=True" not in path.read_text(), path
 
 
+def test_linear_algebra_has_one_thread_wherever_the_package_is():
+    """Its sums are rounded otherwise with more, and so are pixels: not by an environment that is set too late alone."""
+    code = "import numpy; import romandask, threadpoolctl, json; print(json.dumps(threadpoolctl.threadpool_info()))"
+    environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    pools = [pool for pool in json.loads(done.stdout) if pool["user_api"] == "blas"]
+    assert pools
+    assert {pool["num_threads"] for pool in pools} == {1}
+
+
 def test_only_the_cluster_knows_distributed():
     users = [
         path.name
@@ -104,8 +117,8 @@ def test_ruff_finds_nothing():
     assert done.returncode == 0, done.stdout
 
 
-def test_types_hold_in_model_and_runtime():
-    command = [sys.executable, "-m", "mypy", "romandask/model", "romandask/runtime"]
+def test_types_hold():
+    command = [sys.executable, "-m", "mypy", *TYPED]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

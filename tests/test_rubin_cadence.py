@@ -369,10 +369,14 @@ def test_five_years_differ_from_the_requirements_as_known():
 
 @pytest.mark.parametrize(("band", "known"), [("u", -0.39), ("g", 0), ("r", 0), ("i", 0), ("z", 0), ("y", 0)])
 def test_noise_and_psf_of_our_images_give_the_published_depth(band, known):
-    """GalSim's u curve has 0.63 mag less throughput than syseng_throughputs 1.7, and 0.12 less than 1.9."""
+    """GalSim's u curve has 0.63 mag less throughput than syseng_throughputs 1.7, and 0.12 less than 1.9.
+
+    Detectors all over the focal plane, each in a visit of its own: the published numbers are means of the field.
+    """
     camera = rubin()
-    exposure = Exposure(0, 94, band, 6e4, 30.0, 53.0, -40.0, 0.0, 0.6, 1.0, nights.DARK[band])
-    pixels = noise_pixels(camera.psf(exposure))
+    rows = [(k, detector) for k, detector in enumerate(range(3, 189, 15))]
+    field = [Exposure(*row, band, 6e4, 30.0, 53.0, -40.0, 0.0, 0.6, 1.0, nights.DARK[band]) for row in rows]
+    exposure, pixels = field[0], np.mean([noise_pixels(camera.psf(exposure)) for exposure in field])
     variance = pixels * camera.pixel_noise(exposure) ** 2
     signal = (25 + np.sqrt(625 + 100 * variance)) / 2
     depth = 2.5 * np.log10(camera.bandpass(band).ab_photons() * 30 / signal)

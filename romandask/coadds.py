@@ -14,7 +14,7 @@ import pandas as pd
 from romandask.coadd_psfs import psf_side
 from romandask.drawn_tiles import DrawTile
 from romandask.drizzled_tiles import DrizzleTile, most_inputs
-from romandask.exposures import RenderExposure, cone, header_text
+from romandask.exposures import cone, header_text
 from romandask.instruments.exposure import EXPOSURE_COLUMNS
 from romandask.kernels.detector import SATURATED
 from romandask.model.config import CoaddSettings
@@ -26,10 +26,9 @@ from romandask.runtime.manifest import digest
 from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
 from romandask.runtime.units import LazyUnits, Unit
+from romandask.tile_maker import TileMaker, source_of
 from romandask.warped_tiles import WarpTile
 
-TileMaker = DrizzleTile | DrawTile | WarpTile
-"""What makes the tiles of a coadd."""
 MAKERS: dict[str, type[TileMaker]] = {"drizzle": DrizzleTile, "draw": DrawTile, "warp": WarpTile}
 
 
@@ -39,9 +38,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
     A tile reads its exposures one at a time from the exposures product: from the store where they are, rendered where
     not. The tiles of an instrument that is drawn from its cadence use the exposures' table and truth, and render none.
     """
-    render = exposures.make
-    if not isinstance(render, RenderExposure):
-        raise TypeError("coadds need the product that exposures() returns")
+    render = source_of(exposures)
     instrument, table = render.instrument, render.table
     grid = settings.grid()
     pixels = grid.pixels(instrument.coadd_scale)

@@ -12,7 +12,6 @@ import pandas as pd
 import xarray as xr
 from astropy.wcs import WCS
 
-from romandask.coadds import TileMaker
 from romandask.exposures import RenderExposure, empty_variance
 from romandask.instruments.exposure import exposure_of
 from romandask.kernels.detector import NO_DATA, usable
@@ -25,6 +24,7 @@ from romandask.psfs import flat_shares
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
 from romandask.runtime.tables import TableProduct
+from romandask.tile_maker import TileMaker
 
 EXPOSURE_LAYERS = {
     "background": ("float32", "electron", "expected electrons that do not come from objects"),
@@ -195,16 +195,14 @@ def _frames(product: ImageProduct) -> Frames:
 
         return Frames(product, corners_of(table), instrument.shape, of_exposure, table["band"].to_numpy(object))
     if isinstance(maker, TileMaker):
-        source: RenderExposure = maker.exposures.make  # type: ignore[assignment]
-        tiles, bands, scale = maker.tiles, source.instrument.bands, source.instrument.coadd_scale
-        side = maker.settings.grid().side
+        bands, side = maker.instrument.bands, maker.settings.grid().side
 
         def of_tile(unit: int) -> dict:
-            return tiles[unit // len(bands)].header(maker.pixels, scale)
+            return maker.header(unit // len(bands))
 
-        corners = np.repeat(np.stack([tile.corners(side) for tile in tiles]), len(bands), axis=0)
+        corners = np.repeat(np.stack([tile.corners(side) for tile in maker.tiles]), len(bands), axis=0)
         shape = (maker.pixels, maker.pixels)
-        return Frames(product, corners, shape, of_tile, np.array(bands * len(tiles), object))
+        return Frames(product, corners, shape, of_tile, np.array(bands * len(maker.tiles), object))
     raise TypeError("cutouts need the product that exposures() or coadds() returns")
 
 

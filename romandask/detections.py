@@ -6,10 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from astropy.wcs import WCS
 
-from romandask.coadds import TileMaker
-from romandask.exposures import RenderExposure
 from romandask.kernels.detector import SATURATED
 from romandask.kernels.extract import (
     SATURATED_CORE,
@@ -34,6 +31,7 @@ from romandask.runtime.store import Variable
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands
+from romandask.tile_maker import TileMaker, tile_maker
 from romandask.zero_points import corrected
 
 EXTENDED = 1.15
@@ -46,11 +44,8 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     The array `segmentation` has the number of the object in whose isophote a pixel lies, the last 24 bits of its
     objectId; 0 for none. Beside each tile's is its table `objects`, each object in the one tile that owns it.
     """
-    maker = coadds.make
-    if not isinstance(maker, TileMaker):
-        raise TypeError("detections need the product that coadds() returns")
-    render, pixels = _render(maker), maker.pixels
-    instrument, bands = render.instrument, render.instrument.bands
+    maker = tile_maker(coadds)
+    render, pixels, instrument, bands = maker.source, maker.pixels, maker.instrument, maker.instrument.bands
     state = {
         "settings": settings.model_dump(exclude={"order", "match_radius", "summary_magnitude"}),
         "bands": bands, "region": vars(region),
@@ -93,8 +88,7 @@ def objects(
     ----------
     zero : offsets of the magnitudes (`zero_points()`), to be taken out; None leaves fluxes as they were measured
     """
-    maker = coadds.make
-    assert isinstance(maker, TileMaker)
+    maker = tile_maker(coadds)
     radius = maker.settings.grid().inner / 3600 * 0.75
     cells = region.cells(settings.order)
     tiles_of: dict[int, list[int]] = {int(cell): [] for cell in cells}
@@ -110,9 +104,8 @@ def objects(
         )
         for cell, members in tiles_of.items()
     )
-    name = _render(maker).instrument.name
     return TableProduct(
-        f"objects/{name}",
+        f"objects/{maker.instrument.name}",
         units,
         CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
         detections.tables["objects"],
@@ -132,9 +125,8 @@ class DetectTile:
 
     def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
         """Return the map of a tile and the objects that it owns (schema: catalogs/objects.yaml)."""
-        maker = self.coadds.make
-        assert isinstance(maker, TileMaker)
-        instrument, tile, settings = _render(maker).instrument, maker.tiles[index], self.settings
+        maker, settings = tile_maker(self.coadds), self.settings
+        instrument, tile = maker.instrument, maker.tiles[index]
         bands = TileBands(self.coadds, instrument, index)
         combined = bands.detection()
         if instrument.detection == "median":
@@ -146,12 +138,12 @@ class DetectTile:
         # a band at a time is in memory
         del combined
         give_back()
-        wcs = WCS(tile.header(maker.pixels, instrument.coadd_scale))
+        wcs = maker.wcs(index)
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region)
         objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, segments, radius)
         at = unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy())
-        dust = _render(maker).truth.milky_way(at, *tile_cone(maker, index)[:3])
+        dust = maker.source.truth.milky_way(at, *tile_cone(maker, index)[:3])
         for band in instrument.bands:
             objects[f"{band}_extinction"] = extinction(instrument.bandpass(band), dust)
         return {"segmentation": segments, "objects": objects}
@@ -235,9 +227,3 @@ class CollectPartition:
             return self.detections.tables["objects"].empty_table().to_pandas()
         found = pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
         return found if self.zero is None else corrected(found, self.zero.load(0))
-
-
-def _render(maker: TileMaker) -> RenderExposure:
-    render = maker.exposures.make
-    assert isinstance(render, RenderExposure)
-    return render

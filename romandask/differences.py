@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.coadds import TileMaker
 from romandask.exposures import RenderExposure
 from romandask.kernels.detector import SATURATED
 from romandask.kernels.difference import Matched, blurred, dipoles, match, matching_kernel
@@ -19,6 +18,7 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands
+from romandask.tile_maker import TileMaker, tile_maker
 
 ROWS = 128
 """Rows of a tile that the template is blurred for at a time."""
@@ -82,14 +82,12 @@ class Side:
     @property
     def maker(self) -> TileMaker:
         """What makes them."""
-        assert isinstance(self.product.make, TileMaker)
-        return self.product.make
+        return tile_maker(self.product)
 
     @property
     def source(self) -> RenderExposure:
         """What makes their exposures."""
-        assert isinstance(self.maker.exposures.make, RenderExposure)
-        return self.maker.exposures.make
+        return self.maker.source
 
     def bands(self, tile: int) -> TileBands:
         """Return the bands of a tile."""
@@ -97,7 +95,7 @@ class Side:
 
     def wcs(self, tile: int) -> WCS:
         """Return the WCS of a tile."""
-        return WCS(self.maker.tiles[tile].header(self.maker.pixels, self.source.instrument.coadd_scale))
+        return self.maker.wcs(tile)
 
 
 @dataclass(frozen=True)

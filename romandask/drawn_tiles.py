@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.wcs import WCS
 
 from romandask.coadd_psfs import psf_side
-from romandask.exposures import RenderExposure, cone
+from romandask.exposures import cone
 from romandask.instruments.exposure import exposure_of
 from romandask.kernels.background import subtract_background
 from romandask.kernels.fourier import POINT
@@ -17,40 +16,30 @@ from romandask.kernels.psf import PsfModel
 from romandask.kernels.render import Scene, draw, draw_wide, plan_stamps
 from romandask.kernels.scene import build_scene
 from romandask.kernels.stack import stack
-from romandask.model.config import CoaddSettings, RenderSettings
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
-from romandask.model.tiles import Tile
 from romandask.pointings import corners_of
 from romandask.psfs import flat_shares
-from romandask.runtime.images import ImageProduct
+from romandask.tile_maker import TileMaker
 
 
 @dataclass(frozen=True)
-class DrawTile:
+class DrawTile(TileMaker):
     """Makes one tile and band from the cadence: the expectation with the effective PSF, and the stack's noise."""
-
-    exposures: ImageProduct
-    tiles: tuple[Tile, ...]
-    members: dict[tuple[int, str], np.ndarray]
-    settings: CoaddSettings
-    pixels: int
-    render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return image, weight, noise, nimages, dq and the PSF."""
-        source: RenderExposure = self.exposures.make  # type: ignore[assignment]
+        source, here = self.source, self.unit(index)
         instrument: Any = source.instrument
-        k, b = divmod(index, len(instrument.bands))
-        tile, band = self.tiles[k], instrument.bands[b]
+        tile, band, wcs = here.tile, here.band, here.wcs
         shape = (self.pixels, self.pixels)
-        wcs = WCS(tile.header(self.pixels, instrument.coadd_scale))
         bandpass = instrument.bandpass(band)
-        chosen = [exposure_of(source.table.iloc[i]) for i in self.members[k, band]]
+        rows = source.table.iloc[here.members]
+        chosen = [exposure_of(row) for _, row in rows.iterrows()]
         to_njy = NJY_ZERO_POINT / bandpass.ab_photons()
         gains = np.array([exposure.exptime for exposure in chosen]) / to_njy
         variances = (np.array([instrument.pixel_noise(exposure) for exposure in chosen]) / gains) ** 2
-        corners = corners_of(source.table.iloc[self.members[k, band]])
+        corners = corners_of(rows)
         polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
         layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
         made = {"weight": layers.weight, "nimages": layers.count, "dq": np.zeros(shape, np.uint8)}

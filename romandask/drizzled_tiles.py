@@ -13,40 +13,27 @@ import pandas as pd
 from astropy.wcs import WCS
 
 from romandask.coadd_psfs import input_psf, psf_side
-from romandask.exposures import RenderExposure, empty_variance
+from romandask.exposures import empty_variance
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.background import as_float, subtract_background
 from romandask.kernels.detector import SATURATED, noise_realisation, usable
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.pixel_map import PixelMap, pixel_map, strips
-from romandask.model.config import CoaddSettings, RenderSettings
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT
-from romandask.model.tiles import Tile
-from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
+from romandask.tile_maker import TileMaker
 
 
 @dataclass(frozen=True)
-class DrizzleTile:
+class DrizzleTile(TileMaker):
     """Makes one tile and band by drizzling its exposures."""
-
-    exposures: ImageProduct
-    tiles: tuple[Tile, ...]
-    members: dict[tuple[int, str], np.ndarray]
-    settings: CoaddSettings
-    pixels: int
-    render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, Any]:
         """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
-        source: RenderExposure = self.exposures.make  # type: ignore[assignment]
-        instrument = source.instrument
-        k, b = divmod(index, len(instrument.bands))
-        tile, band = self.tiles[k], instrument.bands[b]
-        scale = instrument.coadd_scale
-        target = WCS(tile.header(self.pixels, scale))
-        members, shape = self.members[k, band], (self.pixels, self.pixels)
+        source, instrument, here = self.source, self.instrument, self.unit(index)
+        scale, shape = instrument.coadd_scale, (self.pixels, self.pixels)
+        tile, members, target = here.tile, here.members, here.wcs
         exposures = [exposure_of(source.table.iloc[i]) for i in members]
         headers = [instrument.header(exposure) for exposure in exposures]
         frames = [WCS(header) for header in headers]

@@ -6,13 +6,12 @@ import html
 
 import numpy as np
 import pandas as pd
-from astropy.wcs import WCS
 
 from romandask import joint_pictures, pictures
-from romandask.coadds import TileMaker
 from romandask.matches import length_name
 from romandask.page import image_of, table_of
 from romandask.survey import Survey
+from romandask.tile_maker import tile_maker
 
 FIELD = 12.0
 """Half the side of the field that is shown in all bands, arcsec."""
@@ -97,23 +96,20 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     if not len(here):
         return ""
     tiles = {key: survey.coadd_product(key) for key in survey.instruments}
-    frames, images = {}, {}
-    for key, product in tiles.items():
-        assert isinstance(product.make, TileMaker)
-        instrument = survey.instruments[key]
-        frames[key] = WCS(survey.tiles[tile].header(product.make.pixels, instrument.coadd_scale))
+    makers = {key: tile_maker(product) for key, product in tiles.items()}
+    frames, images = {key: maker.wcs(tile) for key, maker in makers.items()}, {}
     x, y = frames["rubin"].all_world2pix(here["coord_ra"], here["coord_dec"], 0)
     scale = survey.instruments["rubin"].coadd_scale
     middle = _crowded(np.stack([x, y], axis=1) * scale, here["blend"].to_numpy(), FIELD)
     # the field lies within the tile
-    extent = scale * tiles["rubin"].make.pixels  # type: ignore[attr-defined]
+    extent = scale * makers["rubin"].pixels
     middle = np.clip(middle, min(FIELD + 1, extent / 2), max(extent - FIELD - 1, extent / 2))
     at = frames["rubin"].all_pix2world(*(middle[:, None] / scale), 0)
     for key, product in tiles.items():
         instrument = survey.instruments[key]
         u, v = (int(round(float(value[0]))) for value in frames[key].all_world2pix(*at, 0))
         count = int(FIELD / instrument.coadd_scale)
-        side = product.make.pixels  # type: ignore[attr-defined]
+        side = makers[key].pixels
         window = tuple(slice(max(place - count, 0), min(place + count + 1, side)) for place in (v, u))
         images[key] = {
             band: product.load(tile * len(instrument.bands) + k, ("image",), window)["image"]

@@ -8,7 +8,6 @@ import numpy as np
 from astropy.wcs import WCS
 
 from romandask.drizzled_tiles import DrizzleTile
-from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import exposure_of
 from romandask.kernels.drizzle import Sums
 from romandask.kernels.pixel_map import pixel_map, strips
@@ -52,9 +51,9 @@ def coverage(coadds: ImageProduct) -> list[Coverage]:
         If the coadds are not drizzled, or a band has no exposure there.
     """
     maker = coadds.make
-    if not isinstance(maker, DrizzleTile) or not isinstance(maker.exposures.make, RenderExposure):
+    if not isinstance(maker, DrizzleTile):
         raise UserError("pixfrac: only Roman's coadds are drizzled, and this pipeline has no Roman")
-    source = maker.exposures.make
+    source = maker.source
     instrument, scale = source.instrument, source.instrument.coadd_scale
     totals = [sum(len(maker.members[k, band]) for band in instrument.bands) for k in range(len(maker.tiles))]
     k = int(np.argmax(totals))

@@ -11,13 +11,13 @@ from astropy.wcs import WCS
 
 from romandask.coadd_psfs import jacobian, psf_side, star_on
 from romandask.drizzled_tiles import DrizzleTile
-from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of
 from romandask.kernels.coadd_psf import drizzled_psf
 from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
 from romandask.psfs import OVERSAMPLING, psf_image
 from romandask.runtime.images import ImageProduct
+from romandask.tile_maker import tile_maker
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
 """Photons per nm, in any unit, at wavelengths in nm: a `galsim.SED`, for example."""
@@ -64,9 +64,9 @@ def coadd_psf(
         If the survey has no such band, or no exposure at the place.
     """
     maker = coadds.make
-    if not isinstance(maker, DrizzleTile) or not isinstance(maker.exposures.make, RenderExposure):
+    if not isinstance(maker, DrizzleTile):
         raise UserError("PSFs at a place are those of drizzled coadds: of others each tile has one, its array psf")
-    instrument = maker.exposures.make.instrument
+    instrument = maker.instrument
     if band not in instrument.bands:
         raise UserError(f"band {band!r}: this survey has {', '.join(instrument.bands)}")
     owner = int(maker.settings.grid().owner(ra, dec))
@@ -74,7 +74,7 @@ def coadd_psf(
     if not tiles:
         raise UserError(f"({ra}, {dec}): outside the tiles of this survey")
     tile, index = maker.tiles[tiles[0]], tiles[0] * len(instrument.bands) + instrument.bands.index(band)
-    header = tile.header(maker.pixels, instrument.coadd_scale)
+    header = maker.header(tiles[0])
     target = WCS(header)
     seen = _seen(coadds, index, maker.members[tiles[0], band], instrument, ra, dec, target)
     if not seen:
@@ -108,10 +108,8 @@ def _seen(
     coadds: ImageProduct, index: int, members: np.ndarray, instrument: Instrument, ra: float, dec: float, target: WCS
 ) -> list[Seen]:
     """Return the exposures, of those that touch a tile, of which a place of it is made."""
-    maker = coadds.make
-    assert isinstance(maker, DrizzleTile)
-    assert isinstance(maker.exposures.make, RenderExposure)
-    table = maker.exposures.make.table
+    maker = tile_maker(coadds)
+    table = maker.source.table
     if coadds.has(index):
         column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
         found = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))

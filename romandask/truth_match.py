@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from romandask.coadds import TileMaker
 from romandask.detections import DetectTile, owned, tile_cone
 from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Instrument
@@ -19,6 +18,7 @@ from romandask.runtime.images import ImageProduct
 from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
+from romandask.tile_maker import TileMaker, tile_maker
 
 BINS = np.arange(17.0, 30.01, 0.5)
 """Magnitudes between which completeness and purity are counted."""
@@ -148,8 +148,5 @@ def _units(detections: ImageProduct, source: str, state: dict) -> tuple[Unit, ..
 def _makers(detections: ImageProduct) -> tuple[DetectTile, TileMaker, RenderExposure]:
     maker = detections.make
     assert isinstance(maker, DetectTile)
-    tiles = maker.coadds.make
-    assert isinstance(tiles, TileMaker)
-    render = tiles.exposures.make
-    assert isinstance(render, RenderExposure)
-    return maker, tiles, render
+    tiles = tile_maker(maker.coadds)
+    return maker, tiles, tiles.source

@@ -8,47 +8,35 @@ import numpy as np
 from astropy.wcs import WCS
 
 from romandask.coadd_psfs import jacobian, psf_side
-from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of, pixel_areas
 from romandask.kernels.background import as_float, subtract_background
 from romandask.kernels.coadd_psf import warped_psf
 from romandask.kernels.detector import SATURATED, noise_realisation, usable
 from romandask.kernels.pixel_map import pixel_map, strips
 from romandask.kernels.warp import Means
-from romandask.model.config import CoaddSettings, RenderSettings
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.model.tiles import Tile
 from romandask.psfs import OVERSAMPLING, psf_image
-from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
+from romandask.tile_maker import TileMaker
 
 
 @dataclass(frozen=True)
-class WarpTile:
+class WarpTile(TileMaker):
     """Makes one tile and band of the exposures that touch it."""
-
-    exposures: ImageProduct
-    tiles: tuple[Tile, ...]
-    members: dict[tuple[int, str], np.ndarray]
-    settings: CoaddSettings
-    pixels: int
-    render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return image, weight, noise, nimages, dq and the PSF."""
-        source: RenderExposure = self.exposures.make  # type: ignore[assignment]
-        instrument = source.instrument
-        k, b = divmod(index, len(instrument.bands))
-        tile, band = self.tiles[k], instrument.bands[b]
-        target, shape = WCS(tile.header(self.pixels, instrument.coadd_scale)), (self.pixels, self.pixels)
+        source, instrument, here = self.source, self.instrument, self.unit(index)
+        target, shape = here.wcs, (self.pixels, self.pixels)
         sums, side = Means(shape, 1 + self.settings.noise), psf_side(instrument)
         psf, used = np.zeros((side, side)), 0.0
-        for i in self.members[k, band].tolist():
+        for i in here.members.tolist():
             exposure = exposure_of(source.table.iloc[i])
             weight = self._add(sums, exposure, i, target, source.seed)
             if weight:
-                psf += weight * _psf(instrument, exposure, target, tile)
+                psf += weight * _psf(instrument, exposure, target, here.tile)
                 used += weight
         give_back()
         scale = np.float32(instrument.coadd_scale**2)
@@ -64,7 +52,7 @@ class WarpTile:
 
     def _add(self, sums: Means, exposure: Exposure, index: int, target: WCS, seed: int) -> float:
         """Add an exposure; return its weight in the whole tile: 1 / nJy2 of a pixel, times pixels."""
-        instrument = self.exposures.make.instrument  # type: ignore[attr-defined]
+        instrument = self.instrument
         header, shape = instrument.header(exposure), (self.pixels, self.pixels)
         frame = WCS(header)
         # the part of the tile that the exposure may cover, and of the exposure that the tile may

@@ -30,7 +30,7 @@ LAYERS = [
     {"differences", "matches", "samples", "detections", "cutouts", "effects", "star", "pixfrac"},
     {"coadds", "tile_layers", "zero_points", "validation", "lensing"},
     {"drizzled_tiles", "drawn_tiles", "warped_tiles"},
-    {"coadd_psfs"},
+    {"coadd_psfs", "tile_maker"},
     {"truth_index", "psfs"},
     {"exposures"},
     {"pointings", "truth", "readout", "ccd_readout"},

@@ -10,6 +10,7 @@ from conftest import command
 from scipy.spatial import cKDTree
 
 import romandask as rd
+from romandask.export import export_truth
 from romandask.exposures import wcs_of
 from romandask.flow import run_figures
 from romandask.formats.spectra import galaxy_templates
@@ -313,3 +314,10 @@ def test_validation_agrees_with_the_noise_of_the_coadds(survey, name):
     bright = table[table["magnitude"].between(20, 25) & (table["objects"] >= 5)]
     assert len(bright) >= 3
     assert bright["bias"].abs().median() < 0.2
+
+
+def test_a_generated_survey_leaves_as_files_too(survey, tmp_path):
+    paths = export_truth(survey, tmp_path)
+    with fits.open(paths[0]) as hdus:
+        assert len(hdus[1].data) > 500
+        assert "sed_val_disk" not in hdus[1].columns.names

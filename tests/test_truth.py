@@ -30,7 +30,7 @@ from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
 from romandask.runtime.work import Task
 from romandask.stages import stages
-from romandask.survey import Survey, open_survey
+from romandask.survey import Survey
 from romandask.truth import truth
 
 REGION = Region(53.0, 53.04, -40.03, -40.0)
@@ -293,13 +293,6 @@ def test_truth_leaves_as_fits_and_hdf5(tmp_path, shared):
     (survey.store.record("truth/stars", survey.truth_catalogs.stars.names[0])).unlink()
     with pytest.raises(UserError, match="truth/stars is not all there: 1 of"):
         export_truth(Survey(survey.pipeline, survey.store), tmp_path / "again")
-
-
-def test_a_generated_survey_leaves_as_files_too(tiny_store, tmp_path):
-    paths = export_truth(open_survey(tiny_store), tmp_path)
-    with fits.open(paths[0]) as hdus:
-        assert len(hdus[1].data) > 500
-        assert "sed_val_disk" not in hdus[1].columns.names
 
 
 def test_a_missing_column_or_a_truncated_file_is_named(shared, tmp_path):

@@ -33,7 +33,7 @@ def export_truth(survey: Survey, folder: Path) -> list[Path]:
                 f"{product.stage} is not all there: {len(missing)} of {len(product.names)} units are missing, first "
                 f"{missing[0]}; run the survey first"
             )
-    _prepare(folder)
+    prepare(folder)
     bins = max(len(catalogs.edges) - 1, 0)
     written = []
     for product in (catalogs.galaxies, catalogs.stars):
@@ -54,7 +54,7 @@ def export_obseq(survey: Survey, path: Path) -> int:
         If the survey has no Roman, or the file cannot be written.
     """
     visits = survey.visits("roman")
-    _prepare(path.parent)
+    prepare(path.parent)
     obseq.write(path, visits)
     return len(visits)
 
@@ -73,7 +73,7 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
         if name not in places:
             close = difflib.get_close_matches(name, places, n=1, cutoff=0.0)
             raise UserError(f"exposure {name!r}: this survey has {len(places)}, nearest {', '.join(close) or 'none'}")
-    _prepare(folder)
+    prepare(folder)
     attributes = product.variables[0].attributes
     table = survey.pointings("roman")
     written = []
@@ -97,7 +97,7 @@ def export_coadd_psf(
         If there is no exposure of a band there, or the folder cannot be written.
     """
     images = {band: survey.psf(ra, dec, band, scale=scale) for band in bands or survey.instruments["roman"].bands}
-    _prepare(path)
+    prepare(path)
     written = []
     for band, image in images.items():
         written.append(path / f"psf-{band}-{ra:.5f}_{dec:+.5f}.fits")
@@ -119,7 +119,7 @@ def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size
     bands = bands or list(survey.instruments["roman"].bands)
     layers = ("image", "background", "weight", "dq", "psf")
     every = {band: survey.cutouts(objects, layers, (band,), size) for band in bands}
-    _prepare(folder)
+    prepare(folder)
     names = survey.exposure_product("roman").names
     exptimes = dict(zip(names, survey.pointings("roman")["exptime"], strict=True))
     written = []
@@ -160,7 +160,8 @@ def _parts(product: TableProduct) -> Iterator[pd.DataFrame]:
         yield product.load(index)
 
 
-def _prepare(folder: Path) -> None:
+def prepare(folder: Path) -> None:
+    """Make a folder; UserError where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Set
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from importlib.metadata import version
 
 from romandask.incoming import source_rows
@@ -14,11 +15,12 @@ from romandask.runtime.cluster import Runner
 from romandask.runtime.hats import write_catalog_files
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
-from romandask.runtime.manifest import Record, digest, read_record
+from romandask.runtime.log import Log, events, newest
+from romandask.runtime.manifest import read_record
+from romandask.runtime.pending import Pending, drop_strays, failures, pending, write_failure
 from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
-from romandask.runtime.store import Store, write_bytes, write_json
-from romandask.runtime.units import Unit
+from romandask.runtime.store import Store, refuse_full, write_bytes, write_json
 from romandask.runtime.work import Task
 from romandask.stages import Chosen, Product, Stage, stages
 from romandask.survey import Survey
@@ -59,30 +61,53 @@ class Explained:
 class Summary:
     """What a run did."""
 
+    begun: int = 0
+    """Units that were handed out."""
     made: dict[str, int] = field(default_factory=dict)
     kept: dict[str, int] = field(default_factory=dict)
     failed: list[str] = field(default_factory=list)
     """stage/unit of units that were set aside, and of those that wait for them."""
+    warnings: Counter[str] = field(default_factory=Counter)
+    """What units warned of, and how many did."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the stages of one run share."""
+
+    survey: Survey
+    store: Store
+    runner: Runner
+    reporter: Reporter
+    log: Log
+    retry: bool
+    summary: Summary = field(default_factory=Summary)
+    ends: ExitStack = field(default_factory=ExitStack)
+    """What is to be closed at the end."""
 
 
 def run(
-    pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter, chosen: Chosen | None = None
-) -> Summary:  # fmt: skip
+    pipeline: Pipeline,
+    store: Store,
+    runner: Runner,
+    reporter: Reporter,
+    chosen: Chosen | None = None,
+    retry: bool = False,
+) -> Summary:
     """Make and store, in order, what is missing or no longer what the pipeline asks for.
 
     Parameters
     ----------
     chosen : stages; None for all. A unit of theirs whose inputs are not stored waits, and is told of.
+    retry : make again what failed in an earlier run; else it stays aside until something that it depends on changes
     """
-    summary = Summary()
-    with locked(store.root):
-        survey = _begin(pipeline, store)
-        for stage in (chosen or Chosen()).of(stages(survey)):
-            _make_stage(stage, survey, store, runner, reporter, summary)
-    return summary
+    with _running(pipeline, store, runner, reporter, retry) as this:
+        for stage in (chosen or Chosen()).of(stages(this.survey)):
+            _make_stage(stage, this)
+    return this.summary
 
 
-def explain(survey: Survey, chosen: Chosen | None = None) -> list[Explained]:
+def explain(survey: Survey, chosen: Chosen | None = None, retry: bool = False) -> list[Explained]:
     """Return, a stage, which units a run would make and why, making nothing.
 
     What depends on a unit that is to be made is counted with it, though it may turn out the same.
@@ -92,10 +117,11 @@ def explain(survey: Survey, chosen: Chosen | None = None) -> list[Explained]:
     rows = []
     for stage in (chosen or Chosen()).of(stages(survey)):
         product = stage.product(survey)
-        tasks, kept, blocked = _tasks(product, store, coming)
-        coming |= {(product.stage, product.names[task.index]) for task in tasks}
-        reasons = Counter(task.why for task in tasks) + Counter({"an input is missing": len(blocked)})
-        rows.append(Explained(stage.name, len(tasks), kept, dict(reasons.most_common())))
+        todo = pending(product, store, coming, retry)
+        coming |= {(product.stage, product.names[task.index]) for task in todo.tasks}
+        reasons = Counter(task.why for task in todo.tasks)
+        reasons += Counter({"an input is missing": len(todo.blocked), "set aside, it failed": len(todo.aside)})
+        rows.append(Explained(stage.name, len(todo.tasks), todo.kept, dict(reasons.most_common())))
     return rows
 
 
@@ -107,12 +133,11 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     RuntimeError
         If the numbers do not add up.
     """
-    summary = Summary()
-    with locked(store.root):
-        survey = _begin(pipeline, store)
+    with _running(pipeline, store, runner, reporter, retry=True) as this:
+        survey, summary = this.survey, this.summary
         for stage in stages(survey):
             if stage.name.startswith("truth/"):
-                _make_stage(stage, survey, store, runner, reporter, summary)
+                _make_stage(stage, this)
     catalogs = survey.truth_catalogs
     out = sum(int(product.column("n_rows").sum()) for product in (catalogs.galaxies, catalogs.stars))
     aside = {row["stage"]: row["rows"] for row in run_figures(store)}.get("truth/quarantine", 0)
@@ -122,44 +147,51 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     return counts
 
 
-def _begin(pipeline: Pipeline, store: Store) -> Survey:
-    """Store the resolved settings and the packages' versions, and return the survey."""
-    write_bytes(store.pipeline, pipeline.to_yaml().encode())
-    write_json(store.root / "versions.json", {name: version(name) for name in PACKAGES})
-    seal(store, "store", [store.pipeline, store.root / "versions.json"])
-    return Survey(pipeline, store)
+@contextmanager
+def _running(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter, retry: bool) -> Iterator[Run]:
+    """Hold the store, write the resolved settings and the packages' versions, and log how the run begins and ends."""
+    with locked(store.root):
+        versions = {name: version(name) for name in PACKAGES}
+        write_bytes(store.pipeline, pipeline.to_yaml().encode())
+        write_json(store.root / "versions.json", versions)
+        seal(store, "store", [store.pipeline, store.root / "versions.json"])
+        this = Run(Survey(pipeline, store), store, runner, reporter, Log(store.log), retry)
+        this.log.write("run", pipeline=pipeline.name, on=runner.description, versions=versions)
+        end = "stopped"
+        try:
+            with this.ends:
+                yield this
+            end = "done"
+        finally:
+            made, kept = sum(this.summary.made.values()), sum(this.summary.kept.values())
+            this.log.write("end", how=end, made=made, kept=kept, failed=len(this.summary.failed))
 
 
-def _make_stage(
-    stage: Stage, survey: Survey, store: Store, runner: Runner, reporter: Reporter, summary: Summary
-) -> None:
-    _run_stage(stage, stage.product(survey), store, runner, reporter, summary)
+def _make_stage(stage: Stage, this: Run) -> None:
+    with this.reporter.busy(f"{stage.name}: finding what there is to do"):
+        product = stage.product(this.survey)
+        todo = pending(product, this.store, retry=this.retry)
+    _run_stage(stage, product, todo, this)
     if stage.name == "truth/galaxies":
-        write_spectra(survey.truth_catalogs, store)
-        seal(store, "truth/seds", sorted(store.images("truth/seds").rglob("*")))
+        write_spectra(this.survey.truth_catalogs, this.store)
+        seal(this.store, "truth/seds", sorted(this.store.images("truth/seds").rglob("*")))
 
 
-def _run_stage(
-    stage: Stage, product: Product, store: Store, runner: Runner, reporter: Reporter, summary: Summary
-) -> None:
-    tasks, kept, blocked = _tasks(product, store)
-    summary.kept[stage.name] = kept
-    summary.failed += [f"{stage.name}/{name} (an input is missing)" for name in blocked]
-    _drop_strays(product, store)
+def _run_stage(stage: Stage, product: Product, todo: Pending, this: Run) -> None:
+    store, summary = this.store, this.summary
+    summary.kept[stage.name] = todo.kept
+    summary.failed += [f"{stage.name}/{name} (an input is missing)" for name in todo.blocked]
+    summary.failed += [f"{stage.name}/{name} (set aside, it failed before)" for name in todo.aside]
+    drop_strays(product, store, {product.names[task.index] for task in todo.tasks})
     made = 0
-    if tasks:
+    if todo.tasks:
         unseal(store, stage.name)
         product.prepare(store)
-        # a unit that is made again reads its upstream from the store, never its own former self
-        with reporter.stage(stage.name, len(tasks)) as meter:
-            for outcome in runner.run(product, tasks, store):
-                meter.advance()
-                if outcome.record is not None:
-                    made += 1
-                    continue
-                name = product.names[outcome.index]
-                summary.failed.append(f"{stage.name}/{name}")
-                write_bytes(_failure_path(store, product, name), str(outcome.failure).encode())
+        if not summary.begun:
+            this.ends.enter_context(this.runner.recording(this.log.path.with_suffix(".html")))
+        summary.begun += len(todo.tasks)
+        this.log.write("stage", stage=stage.name, make=len(todo.tasks), keep=todo.kept, blocked=len(todo.blocked))
+        made = _make_units(stage, product, todo.tasks, this)
     summary.made[stage.name] = made
     if stage.position is not None and (made or not (store.catalog(product.stage) / "hats.properties").exists()):
         write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
@@ -170,97 +202,34 @@ def _run_stage(
             seal(store, stage.name, catalog_files(store, stage.name))
 
 
-def _tasks(
-    product: Product, store: Store, coming: Set[tuple[str, str]] | None = None
-) -> tuple[list[Task], int, list[str]]:
-    """Return the units to make, how many are done, and those that wait for an input that is missing.
+def _make_units(stage: Stage, product: Product, tasks: list[Task], this: Run) -> int:
+    """Make units, and return how many there were; those that fail are set aside with the reason.
 
-    The records of units that are to be made, or cannot be, are removed, but in a plan.
-
-    Parameters
-    ----------
-    coming : in a plan, units of earlier stages that will be made; None in a run
+    Raises
+    ------
+    UserError
+        If the store can take no more: that is no unit's fault, and every other would fail too.
     """
-    outputs: dict[tuple[str, str], str | None] = dict.fromkeys(coming or (), "to be made")
-    forget = coming is None
-
-    def output(source: tuple[str, str]) -> str | None:
-        if source not in outputs:
-            record = read_record(store, *source)
-            outputs[source] = record.output if record else None
-        return outputs[source]
-
-    tasks: dict[str, Task] = {}
-    blocked: list[str] = []
-    waiting: dict[str, tuple[str, ...]] = {}
-    kept = 0
-    for index, unit in enumerate(product.units):
-        if any(output(source) is None for source in unit.inputs):
-            blocked.append(unit.name)
-            if forget:
-                store.record(product.stage, unit.name).unlink(missing_ok=True)
-            continue
-        parts = _parts(unit, output)
-        inputs, record = digest(product.stage, parts), read_record(store, product.stage, unit.name)
-        if record is not None and record.inputs == inputs:
-            kept += 1
-            continue
-        why = _why(store, product.stage, unit.name, record, parts)
-        if forget:
-            store.record(product.stage, unit.name).unlink(missing_ok=True)
-        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
-        waiting[unit.name] = unit.after
-    held = _held(waiting, set(blocked))
-    chosen = [
-        replace(task, after=tuple(tasks[other].index for other in waiting[name] if other in tasks))
-        for name, task in tasks.items()
-        if name not in held
-    ]
-    return chosen, kept, blocked + sorted(held)
-
-
-def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
-    """Return what a unit depends on, by name: its settings, the version, and what it reads of each stage."""
-    read: dict[str, list[str | None]] = {}
-    for source in (*unit.inputs, *unit.optional):
-        read.setdefault(source[0], []).append(output(source))
-    return {"settings": digest(unit.settings), "version": version("romandask")} | {
-        stage: digest(found) for stage, found in read.items()
-    }
-
-
-def _why(store: Store, stage: str, name: str, record: Record | None, parts: dict[str, str]) -> str:
-    """Return why a unit is made."""
-    if record is None:
-        return "damaged record" if store.record(stage, name).exists() else "not there"
-    if not record.parts:
-        return "made by an earlier version"
-    changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
-    if changed == ["version"]:
-        return f"made by version {record.parts.get('version')}"
-    return f"changed: {', '.join(changed)}"
-
-
-def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
-    """Return the units that cannot be made because one that they come after cannot."""
-    held: set[str] = set()
-    while found := {name for name, after in waiting.items() if name not in held and set(after) & (missing | held)}:
-        held |= found
-    return held
-
-
-def _drop_strays(product: Product, store: Store) -> None:
-    """Remove the records of units that the stage no longer has, and of failures that are tried again."""
-    names = set(product.names)
-    for path in store.records(product.stage):
-        if path.stem not in names:
-            path.unlink()
-    for path in store.record(product.stage, "x").parent.glob("*.failed"):
-        path.unlink()
-
-
-def _failure_path(store: Store, product: Product, name: str):
-    return store.record(product.stage, name).with_suffix(".failed")
+    made, known = 0, {task.index: task for task in tasks}
+    # a unit that is made again reads its upstream from the store, never its own former self
+    with this.reporter.stage(stage.name, len(tasks), sum(task.cost for task in tasks)) as meter:
+        for outcome in this.runner.run(product, tasks, this.store):
+            task, name, record = known[outcome.index], product.names[outcome.index], outcome.record
+            meter.advance(task.cost)
+            if record is not None:
+                made += 1
+                figures = {"seconds": record.seconds, "bytes": record.bytes, "rows": record.rows}
+                this.log.write(
+                    "unit", stage=stage.name, unit=name, why=task.why, **figures,
+                    peak_bytes=record.peak_bytes, warnings=record.warnings,
+                )  # fmt: skip
+                this.summary.warnings.update(record.warnings)
+                continue
+            refuse_full(outcome.error, this.store)
+            this.summary.failed.append(f"{stage.name}/{name}")
+            write_failure(this.store, product.stage, name, task.inputs, str(outcome.failure))
+            this.log.write("failed", stage=stage.name, unit=name, why=task.why, reason=str(outcome.failure))
+    return made
 
 
 def status(survey: Survey) -> list[tuple[str, int, int, int]]:
@@ -269,8 +238,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     assert store is not None
     rows = []
     for stage in stages(survey):
-        folder = store.record(stage.name, "x").parent
-        failed = len(list(folder.glob("*.failed")))
+        failed = len(failures(store, stage.name))
         done = len(store.records(stage.name))
         known = stage.name.startswith(("truth/", "pointings/"))
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
@@ -279,6 +247,24 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
             units = -1
         rows.append((stage.name, units, done, failed))
     return rows
+
+
+def last_event(survey: Survey) -> str:
+    """Return one line about what the newest run of a store did last; empty where none has been logged."""
+    assert survey.store is not None
+    path = newest(survey.store.log)
+    found = list(events(path)) if path else []
+    if not found:
+        return ""
+    last = found[-1]
+    what = {
+        "run": "it began, on {on}",
+        "stage": "{stage}: {make} units to make",
+        "unit": "{stage}/{unit} was made in {seconds} s",
+        "failed": "{stage}/{unit} failed",
+        "end": "it ended ({how}): made {made}, kept {kept}, failed {failed}",
+    }
+    return f"newest run, {last['time']}: {what[last['event']].format(**last)}"
 
 
 def run_figures(store: Store) -> list[dict]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from romandask.instruments.exposure import Instrument
 from romandask.instruments.roman import Roman, RomanSettings
@@ -49,6 +49,12 @@ class Pipeline(Section):
     lensing: LensingSettings = LensingSettings()
     differences: DifferenceSettings = DifferenceSettings()
     run: RunSettings = RunSettings()
+
+    @model_validator(mode="after")
+    def _has_survey(self) -> Pipeline:
+        if self.roman is None and self.rubin is None:
+            raise ValueError("sections roman and rubin are both left out: a survey has one of them, or both")
+        return self
 
     def instruments(self) -> dict[str, Instrument]:
         """Return the instruments of this survey by name, in order."""

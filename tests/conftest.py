@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -51,11 +52,17 @@ MINI = (
 
 
 @pytest.fixture(scope="session")
-def tiny_store(tmp_path_factory) -> Path:
-    """The tiny pipeline, run once by the command line from an empty folder."""
-    folder = tmp_path_factory.mktemp("tiny")
-    done = command("run", "tiny", "--store", "tiny", cwd=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
+def tiny_store(tmp_path_factory, worker_id) -> Path:
+    """The tiny pipeline, run once by the command line from an empty folder; test processes share it, and only read."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder if worker_id == "master" else folder.parent) / "tiny-survey"
+    folder.mkdir(exist_ok=True)
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "done").exists():
+            done = command("run", "tiny", "--store", "tiny", cwd=folder)
+            assert done.returncode == 0, done.stdout + done.stderr
+            (folder / "done").write_text("")
     return folder / "tiny"
 
 

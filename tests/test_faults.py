@@ -1,15 +1,24 @@
 """Faults: every byte that is not as it was written is found, and the same command makes the same bytes again."""
 
+import errno
 import json
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import yaml
 from conftest import MINI, command
 
+from romandask.cli import main
+from romandask.model.errors import UserError
 from romandask.model.seeds import rng
 from romandask.runtime.manifest import digest
+from romandask.runtime.store import Store, refuse_full
 from romandask.survey import open_survey
 from romandask.verification import BESIDE, verify
 
@@ -25,9 +34,9 @@ def store(tmp_path_factory) -> Path:
 
 
 def stored(store: Path) -> list[Path]:
-    """Return every file of a store but its report, which is made from the others."""
+    """Return every file of a store but its report, which is made from the others, and the logs of its runs."""
     files = (path for path in sorted(store.rglob("*")) if path.is_file() and path.stat().st_size)
-    return [path for path in files if path.relative_to(store).parts[0] not in ("report", ".lock")]
+    return [path for path in files if path.relative_to(store).parts[0] not in ("report", "log", ".lock")]
 
 
 def stage_of(store: Path, path: Path) -> str:
@@ -129,3 +138,45 @@ def test_a_store_that_cannot_be_written_is_refused_by_one_line(tmp_path):
     assert done.stderr.startswith("error: ")
     assert len(done.stderr.strip().splitlines()) == 1
     assert np.array([path.name for path in tmp_path.iterdir()]).tolist() == ["file"]
+
+
+def test_a_disk_that_is_full_ends_the_run_with_one_line_and_the_same_command_resumes(tmp_path, monkeypatch, capsys):
+    """No unit is blamed for it, and what was stored before stays."""
+    pq.write_table(pa.table({"id": [1, 2], "ra": [53.0, 53.1], "dec": [-40.0, -40.1]}), tmp_path / "stars.parquet")
+    columns = {"id": "id", "ra": "ra", "dec": "dec", "magnorm": 20, "sed": "=none.txt"}
+    stars = {"path": "stars.parquet", "columns": columns}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump({"stars": stars}))
+    (tmp_path / "seds").mkdir()
+    place = os.replace
+
+    def full(source, target):
+        if "quarantine" in str(target) and str(target).endswith(".parquet"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(target))
+        place(source, target)
+
+    arguments = ["romandask", "ingest", "table", str(tmp_path / "map.yaml"), "--store", str(tmp_path / "s")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert ended.value.code == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert len(told) == 1
+    assert "No space left on device" in told[0]
+    assert "the same command resumes" in told[0]
+    assert not list((tmp_path / "s" / "manifest").rglob("*.failed"))
+    assert (tmp_path / "s" / "manifest" / "truth" / "incoming").is_dir()
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert "rows in 2 = rows out 0 + quarantined 2" in capsys.readouterr().out
+
+
+def test_an_error_of_the_disk_is_known_through_what_came_of_it(tmp_path):
+    refuse_full(None, Store(tmp_path))
+    refuse_full(OSError(errno.ENOENT, "No such file"), Store(tmp_path))
+    wrapped = RuntimeError("could not be written")
+    wrapped.__cause__ = OSError(errno.EROFS, "Read-only file system")
+    with pytest.raises(UserError, match="Read-only file system"):
+        refuse_full(wrapped, Store(tmp_path))

@@ -15,10 +15,13 @@ from conftest import ROOT
 from romandask.cli import app
 
 PACKAGE = ROOT / "romandask"
-TYPED = [f"romandask/{name}" for name in ("model", "runtime", "formats", "cli.py", "flow.py", "verification.py")]
+_TYPED = "model runtime formats cli.py ingest_commands.py export_commands.py flow.py verification.py"
+TYPED = [f"romandask/{name}" for name in _TYPED.split()]
 LAYERS = [
     {"cli"},
-    {"report", "export", "verification"},
+    {"ingest_commands", "export_commands"},
+    {"export_images"},
+    {"arguments", "report", "export", "verification"},
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},

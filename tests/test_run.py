@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import MINI, command
+from conftest import MINI, ROOT, command
 
 STAGES = (
     "truth/galaxies",
@@ -29,8 +30,8 @@ def outputs(store: Path) -> dict[str, str]:
 
 
 def products(store: Path) -> dict[str, bytes]:
-    """Bytes of every file of the products: not the manifest (times), the report or the stored settings."""
-    skipped = ("manifest", "report", "pipeline.yaml", "versions.json", ".lock")
+    """Bytes of every file of the products: not the manifest and logs (times), the report or the stored settings."""
+    skipped = ("manifest", "report", "log", "pipeline.yaml", "versions.json", ".lock")
     paths = [path for path in store.rglob("*") if path.is_file() and path.relative_to(store).parts[0] not in skipped]
     texts = {"zarr.json", "hats.properties"}
     return {str(path.relative_to(store)): path.read_bytes() for path in paths if path.name not in texts}
@@ -45,6 +46,22 @@ def one_worker(tmp_path_factory) -> Path:
     found = outputs(folder / "s")
     assert all(any(name.startswith(stage) for name in found) for stage in STAGES)
     return folder / "s"
+
+
+def test_a_run_leaves_a_log_of_its_units_and_what_the_cluster_did(one_worker):
+    (path,) = (one_worker / "log").glob("*.jsonl")
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    units = {f"{one['stage']}/{one['unit']}" for one in found if one["event"] == "unit"}
+    assert units == set(outputs(one_worker))
+    assert found[0]["event"] == "run"
+    assert found[0]["versions"]["romandask"]
+    assert found[-1] == {
+        "time": found[-1]["time"], "event": "end", "how": "done", "made": len(units), "kept": 0, "failed": 0,
+    }  # fmt: skip
+    page = path.with_suffix(".html").read_text()
+    assert "coadds-roman" in page
+    for line in re.findall(r"<(?:script|link)[^>]*>", page):
+        assert "http" not in line
 
 
 def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_path):
@@ -109,11 +126,15 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
 
 
 def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
-    """An exposure that cannot be read: what needs it is set aside with its traceback, and the exit code is 1."""
+    """An exposure that cannot be read: what needs it is set aside with its traceback, and the exit code is 1.
+
+    It stays aside, for it would fail again, until it is asked for; repaired, it is what it was.
+    """
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert done.returncode == 0
     shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
     record = next((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.json"))
+    before = outputs(tmp_path / "s")
     record.unlink()
     for path in shard.parent.rglob("*"):
         if path.is_file():
@@ -123,7 +144,19 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     failed = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert failed.returncode == 1, failed.stdout
     assert "failed: coadds/roman/" in failed.stdout
-    assert list((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed"))
+    (reason,) = (tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed")
+    written = reason.stat().st_mtime_ns
+    assert "Traceback" in reason.read_text()
+    again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    assert again.returncode == 1
+    assert f"failed: coadds/roman/{reason.stem} (set aside, it failed before)" in again.stdout
+    assert "--retry-failed" in again.stdout
+    assert reason.stat().st_mtime_ns == written
+    assert command("verify", str(tmp_path / "s"), "--forget").returncode == 1
+    mended = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--retry-failed", cwd=tmp_path)
+    assert mended.returncode == 0, mended.stdout
+    assert not reason.exists()
+    assert outputs(tmp_path / "s") == before
 
 
 def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
@@ -163,10 +196,56 @@ def test_a_stage_alone_makes_what_its_inputs_allow(tmp_path):
     assert "an input is missing" in early.stdout
 
 
+def test_workers_of_a_cluster_elsewhere_make_the_same(one_worker, tmp_path):
+    """Scheduler and worker are processes of their own, in folders of their own; what does not fit them is refused."""
+    arguments = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(tmp_path / "s.json")]
+    environment = os.environ | {"DASK_CONFIG": str(ROOT / "pipelines" / "cluster" / "workers.yaml")}
+
+    def process(*words: str) -> subprocess.Popen:
+        folder = tmp_path / words[0]
+        folder.mkdir()
+        return subprocess.Popen(
+            [sys.executable, "-m", "dask", *words], cwd=folder, env=environment,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+
+    scheduler = process("scheduler", *arguments)
+    try:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "s.json").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        address = json.loads((tmp_path / "s.json").read_text())["address"]
+        assert address.startswith("tcp://127.0.0.1:")
+        worker = process("worker", address, "--nthreads", "1", "--memory-limit", "2GiB", "--no-dashboard")
+        try:
+            some = ["--only", "truth", "--only", "pointings"]
+            on = ["--scheduler", address, *MINI, *some]
+            done = command("run", "tiny", "--store", "s", *on, cwd=tmp_path)
+            assert done.returncode == 0, done.stdout + done.stderr
+            made = outputs(tmp_path / "s")
+            assert made
+            assert made == {name: hash_ for name, hash_ in outputs(one_worker).items() if name in made}
+            wrong = command("run", "tiny", "--store", "t", *on, "run.memory_limit=3", cwd=tmp_path)
+            assert wrong.returncode == 2
+            assert "a worker has 2.00 GiB, run.memory_limit is 3" in wrong.stderr
+            assert not (tmp_path / "t").exists()
+        finally:
+            worker.terminate()
+            worker.wait()
+    finally:
+        scheduler.terminate()
+        scheduler.wait()
+
+
 def test_status_and_report_of_a_store(one_worker):
     shown = command("status", str(one_worker))
     assert shown.returncode == 0
     assert "exposures/roman" in shown.stdout
+    assert "newest run, " in shown.stdout
+    watched = command("status", str(one_worker), "--watch")
+    assert watched.returncode == 0, watched.stderr
+    assert "exposures/roman" in watched.stdout
     made = command("report", str(one_worker))
     assert made.returncode == 0, made.stderr
     page = (one_worker / "report" / "index.html").read_text()

@@ -46,6 +46,8 @@ class Text:
     lines: tuple[int, ...]
     """Number of the first line that starts in each block."""
     rows: int
+    """Lines that are objects, or nothing that is known."""
+    objects: int
     header: dict[str, float | int | str] = field(default_factory=dict)
     includes: tuple[str, ...] = ()
 
@@ -105,7 +107,7 @@ def open_source(path: Path, block: int = BLOCK) -> Source:
         # as imSim does, files that these include in turn are not read
         paths[Path(name).as_posix()], texts[Path(name).as_posix()] = included, _scan(included, block)
     source = Source(paths, texts, block)
-    if not source.count():
+    if not sum(text.objects for text in texts.values()):
         raise UserError(f"{path}: holds no line 'object ...' and includes no file that does: not an instance catalog")
     return source
 
@@ -139,7 +141,7 @@ def _is_row(line: str) -> bool:
 
 def _scan(path: Path, block: int) -> Text:
     """Return what a text holds, from one pass with a block in memory."""
-    size, lines, rows, number = 0, [], 0, 0
+    size, lines, rows, objects, number = 0, [], 0, 0, 0
     includes: list[str] = []
     rest = b""
     try:
@@ -152,27 +154,28 @@ def _scan(path: Path, block: int) -> Text:
                 size += len(data)
                 number += data.count(b"\n")
                 whole, newline, tail = (rest + data).rpartition(b"\n")
-                found, named = _count(whole + newline)
-                rows, includes, rest = rows + found, includes + named, tail[-LONGEST:]
+                found, known, named = _count(whole + newline)
+                rows, objects, includes, rest = rows + found, objects + known, includes + named, tail[-LONGEST:]
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: cannot be read ({reason}): copy it again") from None
-    found, named = _count(rest)
-    return Text(size, tuple(lines), rows + found, read_header(path), tuple(includes + named))
+    found, known, named = _count(rest)
+    return Text(size, tuple(lines), rows + found, objects + known, read_header(path), tuple(includes + named))
 
 
-def _count(text: bytes) -> tuple[int, list[str]]:
-    """Return the rows of whole lines and the files that they include."""
+def _count(text: bytes) -> tuple[int, int, list[str]]:
+    """Return the rows of whole lines, how many are objects, and the files that they include."""
     objects = text.count(b"\nobject ") + text.startswith(b"object ")
     if objects == text.count(b"\n") + (not text.endswith(b"\n") and bool(text)):
-        return objects, []
-    rows, includes = 0, []
+        return objects, objects, []
+    rows, objects, includes = 0, 0, []
     for line in _decoded(text):
         tokens = line.split()
         rows += _is_row(line)
+        objects += tokens[:1] == ["object"]
         if len(tokens) == 2 and tokens[0] == "includeobj":
             includes.append(tokens[1])
-    return rows, includes
+    return rows, objects, includes
 
 
 def _decoded(data: bytes) -> list[str]:

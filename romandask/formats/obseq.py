@@ -11,6 +11,7 @@ import pandas as pd
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
+from romandask.formats.visits import check_ranges
 from romandask.model.errors import UserError
 
 COLUMNS = ("date", "exptime", "ra", "dec", "pa", "filter")
@@ -46,12 +47,15 @@ def read(path: Path) -> pd.DataFrame:
         raise UserError(f"{path}: column {missing[0]!r} is missing (found {', '.join(sorted(names))})")
     if len(data["date"]) != expected:
         raise UserError(f"{path}: holds {len(data['date'])} of {expected} rows: copy the file again")
-    numbers = {name: np.asarray(data[name], dtype=np.float64) for name in COLUMNS if name != "filter"}
-    for name, values in numbers.items():
+    numbers = {}
+    for name in COLUMNS[:-1]:
+        if data[name].dtype.kind not in "fiu":
+            raise UserError(f"{path}: column {name!r} holds {data[name][0]!r}, expected numbers")
+        numbers[name] = values = np.asarray(data[name], dtype=np.float64)
         if not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values))[0])
             raise UserError(f"{path}: column {name!r}, row {row}: found {values[row]}, expected a finite number")
-    return pd.DataFrame(
+    visits = pd.DataFrame(
         {
             "visit": np.arange(expected),
             "band": [str(value).strip() for value in data["filter"]],
@@ -65,6 +69,8 @@ def read(path: Path) -> pd.DataFrame:
             "sky_brightness": np.nan,
         }
     )
+    check_ranges(visits, path, {})
+    return visits
 
 
 def write(path: Path, visits: pd.DataFrame) -> None:

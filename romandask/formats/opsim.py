@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from romandask.formats.visits import check_ranges
 from romandask.model.errors import UserError
 
 TABLES = ("observations", "SummaryAllProps", "Summary")
@@ -63,6 +64,7 @@ def read(path: Path) -> pd.DataFrame:
     if table == "Summary" and (visits[list(ANGLES)].abs().max() <= 2 * np.pi).all():
         # OpSim 3 wrote radians; some copies were converted to degrees, which a survey's range of angles betrays
         visits[list(ANGLES)] = np.degrees(visits[list(ANGLES)])
+    check_ranges(visits, path, names)
     visits["band"] = visits["band"].astype(str).str.split("_").str[0]
     # a visit that serves several proposals has a row for each
     visits = visits.drop_duplicates(ignore_index=True)

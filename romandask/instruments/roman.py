@@ -8,14 +8,14 @@ from datetime import datetime, timedelta
 from functools import lru_cache, wraps
 from tempfile import TemporaryFile
 from threading import RLock
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import galsim
 import galsim.roman
 import numpy as np
 import pandas as pd
 from galsim.roman import roman_psfs
-from pydantic import Field, NonNegativeInt, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.roman_calibration import CalibrationSource
@@ -35,7 +35,7 @@ from romandask.kernels.psf import (
     place_grid,
     sample,
 )
-from romandask.model.config import Section
+from romandask.model.config import Section, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
@@ -59,7 +59,9 @@ class RomanPointings(Section):
 class RomanSettings(Section):
     """The Roman block of a pipeline."""
 
-    bands: tuple[Literal["Y106", "J129", "H158", "F184"], ...] = ("Y106", "J129", "H158", "F184")
+    bands: Annotated[tuple[Literal["Y106", "J129", "H158", "F184"], ...], AfterValidator(distinct)] = Field(
+        ("Y106", "J129", "H158", "F184"), min_length=1
+    )
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple", "sca"] = Field(
         "simple", description="sky, Poisson and read noise alone, or every effect of each SCA (paper, section 4.4)"

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import galsim
 import numpy as np
 import pandas as pd
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.rubin_cadence import cadence
@@ -26,7 +26,7 @@ from romandask.kernels.seeing import (
     radial_model,
     von_karman_transfer,
 )
-from romandask.model.config import Section
+from romandask.model.config import Section, distinct
 from romandask.model.seeds import rng
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
@@ -68,7 +68,7 @@ class RubinPointings(Section):
 class RubinSettings(Section):
     """The Rubin block of a pipeline."""
 
-    bands: tuple[Band, ...] = ("u", "g", "r", "i", "z", "y")
+    bands: Annotated[tuple[Band, ...], AfterValidator(distinct)] = Field(("u", "g", "r", "i", "z", "y"), min_length=1)
     mode: Literal["coadd", "visits"] = Field(
         "coadd", description="coadd: tiles are drawn directly; visits: each visit and detector, then warped and coadded"
     )

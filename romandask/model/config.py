@@ -9,11 +9,11 @@ import difflib
 import types
 import typing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
@@ -23,7 +23,15 @@ from romandask.model.tiles import TileGrid
 class Section(BaseModel):
     """A part of a pipeline file: frozen, and unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return values of which none is there twice."""
+    again = [value for k, value in enumerate(values) if value in values[:k]]
+    if again:
+        raise ValueError(f"{again[0]} is there twice")
+    return values
 
 
 class RegionSettings(Section):
@@ -142,7 +150,9 @@ class DetectionSettings(Section):
 class MatchSettings(Section):
     """Friends of friends over the samples of all surveys."""
 
-    linking_lengths: tuple[float, ...] = Field((1.0, 0.5), min_length=1, description="arcsec")
+    linking_lengths: Annotated[tuple[Annotated[float, Field(gt=0)], ...], AfterValidator(distinct)] = Field(
+        (1.0, 0.5), min_length=1, description="arcsec"
+    )
     sample: Literal["clean", "all"] = Field(
         "clean", description="clean: unflagged objects with a true counterpart, to the limits; all: every object"
     )
@@ -182,11 +192,24 @@ class RunSettings(Section):
     memory_limit: float = Field(2.0, gt=0.5, description="GiB a worker")
 
 
+class _Loader(yaml.SafeLoader):
+    """Plain values only; a key that is there twice is a mistake, not the last of the two."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        found: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in found:
+                    raise yaml.MarkedYAMLError(problem=f"{key.value} is there twice", problem_mark=key.start_mark)
+                found.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return the mapping that a YAML file holds; UserError where it holds none."""
     try:
         text = path.read_text()
-        content = yaml.safe_load(text)
+        content = yaml.load(text, _Loader)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

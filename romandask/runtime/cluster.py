@@ -7,24 +7,29 @@ from __future__ import annotations
 
 import itertools
 import queue
+import re
 import socket
 import time
 import traceback
 import uuid
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Protocol
 
 import dask
-from distributed import Client, LocalCluster
+import yaml
+from distributed import Client, LocalCluster, performance_report
 
 from romandask.model.errors import UserError
+from romandask.model.resources import resource_folder
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record
 from romandask.runtime.order import Waiting
-from romandask.runtime.store import Store
+from romandask.runtime.store import Store, write_bytes
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.work import Task, make_unit
 
@@ -46,6 +51,8 @@ class Outcome:
     index: int
     record: Record | None
     failure: str | None = None
+    error: BaseException | None = None
+    """What was raised, where it is known."""
 
 
 class Runner(Protocol):
@@ -56,11 +63,18 @@ class Runner(Protocol):
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit, as they end."""
 
+    def recording(self, path: Path) -> AbstractContextManager[Any]:
+        """Write, at the end of the context, a page with what the cluster did in it."""
+
 
 class InProcess:
     """Runs units one after another in this process, for debugging."""
 
     description = "in this process"
+
+    def recording(self, path: Path) -> AbstractContextManager[Any]:
+        """Write nothing: there is no cluster."""
+        return nullcontext()
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; a failure is not tried again."""
@@ -69,8 +83,8 @@ class InProcess:
             task = waiting.next()
             try:
                 yield Outcome(task.index, make_unit(product, task, store))
-            except Exception:
-                yield Outcome(task.index, None, traceback.format_exc())
+            except Exception as error:
+                yield Outcome(task.index, None, traceback.format_exc(), error)
                 yield from _given_up(product, task.index, waiting)
 
 
@@ -80,6 +94,10 @@ class OnCluster:
     def __init__(self, client: Client, description: str):
         self._client = client
         self.description = description
+
+    def recording(self, path: Path) -> AbstractContextManager[Any]:
+        """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
+        return _recording(self._client, path)
 
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit; one that fails is tried up to three times."""
@@ -143,7 +161,7 @@ class OnCluster:
                 else:
                     before = failed.intersection(task.after)
                     text = _after_failed(product, min(before)) if before else _failure(future)
-                    yield Outcome(task.index, None, text)
+                    yield Outcome(task.index, None, text, future.exception() if future.status == "error" else None)
                     given_up = _given_up(product, task.index, waiting)
                     failed |= {task.index, *(outcome.index for outcome in given_up)}
                     yield from given_up
@@ -169,6 +187,25 @@ class OnCluster:
                         f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
                         "(memory: raise run.memory_limit); the same command resumes"
                     ) from None
+
+
+@contextmanager
+def _recording(client: Client, path: Path) -> Iterator[None]:
+    # one page without external assets, written whole
+    temporary = path.with_name(f".{path.name}.partial")
+    report = performance_report(filename=str(temporary), mode="inline")
+    with client.as_current():
+        report.__enter__()
+    try:
+        yield
+    finally:
+        with client.as_current(), suppress(Exception):
+            # a run that is done is done, though its workers are gone and cannot be asked
+            report.__exit__(None, None, None)
+            # but for its icon the page needs nothing from elsewhere
+            page = re.sub(r'<link rel="shortcut icon"[^>]*>', "", temporary.read_text(encoding="utf-8"))
+            write_bytes(path, page.encode())
+            temporary.unlink()
 
 
 def _given_up(product: ImageProduct | TableProduct, failed: int, waiting: Waiting) -> list[Outcome]:
@@ -204,36 +241,32 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
 
     Parameters
     ----------
-    memory_limit : GiB a local worker
+    memory_limit : GiB a worker
+
+    Raises
+    ------
+    UserError
+        If no scheduler answers, or its workers are too small or have another version.
     """
     if scheduler is None and workers == 0:
         yield InProcess()
         return
     if scheduler is not None:
+        if not re.fullmatch(r"(tcp|tls)://\S+:\d+", scheduler):
+            raise UserError(f"--scheduler {scheduler}: write tcp://host:port, or tls://host:port")
         try:
             client = Client(scheduler, timeout="20s")
-        except (OSError, ValueError, TimeoutError) as error:
+        except (OSError, ValueError, TimeoutError, RuntimeError) as error:
             raise UserError(
-                f"--scheduler {scheduler}: no dask scheduler answers there ({type(error).__name__})"
+                f"--scheduler {scheduler}: no dask scheduler answers there ({str(error) or type(error).__name__})"
             ) from None
         with client:
+            _check_workers(client, scheduler, memory_limit)
             yield OnCluster(client, f"cluster at {scheduler}, dashboard {client.dashboard_link}")
         return
-    quiet = {
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.target": False,
-        # a worker that pauses for its heap, with nothing to do, never comes back; one task runs at a time anyway
-        "distributed.worker.memory.pause": False,
-        "distributed.admin.large-graph-warning-threshold": "100MB",
-        # the threads that decode chunks would each keep a heap of their own, and a worker twice what it uses
-        "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2,
-        # large arrays go back to the system at once, not to a heap that grows from unit to unit (with 32 MB it passed a
-        # worker's limit); smaller ones are kept for what comes next, for fresh pages cost time
-        "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 8 << 20,
-        "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 16 << 20,
-    }
+    settings = yaml.safe_load((resource_folder("pipelines") / "cluster" / "workers.yaml").read_text())
     with (
-        dask.config.set(quiet),
+        dask.config.set(dask.config.merge({"distributed": dask.config.get("distributed")}, settings)),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -246,6 +279,33 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         Client(cluster) as client,
     ):
         yield OnCluster(client, f"{workers} local workers, dashboard {cluster.dashboard_link}")
+
+
+def _check_workers(client: Client, scheduler: str, memory_limit: float) -> None:
+    """Look at the workers that are there: others may come, and go."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    smallest = min((worker["memory_limit"] or float("inf") for worker in workers), default=float("inf"))
+    # what a shell calls 2 GB is 7% less than 2 GiB
+    if smallest < 0.93 * memory_limit * 2**30:
+        raise UserError(
+            f"--scheduler {scheduler}: a worker has {smallest / 2**30:.2f} GiB, run.memory_limit is {memory_limit:g}: "
+            "start workers with --memory-limit, or lower run.memory_limit"
+        )
+    try:
+        versions = set(client.run(_version).values())
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"--scheduler {scheduler}: a worker cannot load romandask ({error}): install it there"
+        ) from None
+    if versions - {version("romandask")}:
+        raise UserError(
+            f"--scheduler {scheduler}: a worker has romandask {', '.join(sorted(versions))}, this is "
+            f"{version('romandask')}: install the same everywhere"
+        )
+
+
+def _version() -> str:
+    return version("romandask")
 
 
 def _free_port(wanted: int) -> int:

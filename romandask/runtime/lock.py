@@ -32,11 +32,26 @@ def locked(root: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-def _refuse_or_remove(path: Path, mine: dict) -> None:
+def in_use(root: Path) -> bool:
+    """True where a driver holds the store: one on this host that lives, or any on another."""
+    held = _holder(root / ".lock")
+    if held is None:
+        return False
+    return held.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(held.get("pid") or 0))
+
+
+def _holder(path: Path) -> dict | None:
+    """Return who holds a lock; None where nobody does."""
     try:
-        held = json.loads(path.read_text())
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        return None
     except (OSError, ValueError):
-        held = {}
+        return {}
+
+
+def _refuse_or_remove(path: Path, mine: dict) -> None:
+    held = _holder(path) or {}
     if held.get("host", mine["host"]) != mine["host"]:
         raise UserError(f"{path.parent}: in use by a driver on {held['host']}; if it is gone, remove {path}")
     if held.get("pid") and held["pid"] != mine["pid"] and _alive(int(held["pid"])):
@@ -45,6 +60,8 @@ def _refuse_or_remove(path: Path, mine: dict) -> None:
 
 
 def _alive(pid: int) -> bool:
+    if pid <= 0:
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -62,6 +63,11 @@ class Store:
         """The folder of the report."""
         return self.root / "report"
 
+    @property
+    def log(self) -> Path:
+        """The folder of the logs of runs."""
+        return self.root / "log"
+
     def collection(self, name: str) -> Path:
         """Folder of a HATS collection, for example truth/galaxies: a catalog and its margin."""
         return self.root / name.removesuffix(MARGIN)
@@ -102,6 +108,17 @@ class Store:
             raise UserError(
                 f"{self.root}: the store cannot be written ({error.strerror}): choose another --store"
             ) from None
+
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+
+
+def refuse_full(error: BaseException | None, store: Store) -> None:
+    """Raise a UserError where an error, or what led to it, says that the store's disk can take no more."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _FULL:
+            raise UserError(f"{store.root}: {os.strerror(error.errno)}: make room; the same command resumes") from None
+        error = error.__cause__ or error.__context__
 
 
 def write_bytes(path: Path, content: bytes) -> None:

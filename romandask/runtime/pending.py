@@ -1,0 +1,146 @@
+"""What there is to do of a stage: units that are not there, or not as they would be made now; and those that failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+from romandask.runtime.images import ImageProduct
+from romandask.runtime.manifest import Record, digest, read_record
+from romandask.runtime.store import Store, write_bytes
+from romandask.runtime.tables import TableProduct
+from romandask.runtime.units import Unit
+from romandask.runtime.work import Task
+
+AGAIN = "failed before"
+
+
+@dataclass(frozen=True)
+class Pending:
+    """The units of a stage by what is to be done with them."""
+
+    tasks: list[Task]
+    kept: int
+    """Units that are there as they should be."""
+    blocked: list[str]
+    """Units of which an input is missing."""
+    aside: list[str]
+    """Units that failed, with inputs that have not changed since."""
+
+
+def pending(
+    product: ImageProduct | TableProduct,
+    store: Store,
+    coming: Set[tuple[str, str]] | None = None,
+    retry: bool = False,
+) -> Pending:
+    """Return what is to be done; the records of units that are to be made, or cannot be, are removed, but in a plan.
+
+    Parameters
+    ----------
+    coming : in a plan, units of earlier stages that will be made; None in a run
+    retry : make what failed, too
+    """
+    outputs: dict[tuple[str, str], str | None] = dict.fromkeys(coming or (), "to be made")
+    forget = coming is None
+
+    def output(source: tuple[str, str]) -> str | None:
+        if source not in outputs:
+            record = read_record(store, *source)
+            outputs[source] = record.output if record else None
+        return outputs[source]
+
+    tasks: dict[str, Task] = {}
+    blocked: list[str] = []
+    aside: list[str] = []
+    waiting: dict[str, tuple[str, ...]] = {}
+    kept = 0
+    for index, unit in enumerate(product.units):
+        if any(output(source) is None for source in unit.inputs):
+            blocked.append(unit.name)
+            if forget:
+                store.record(product.stage, unit.name).unlink(missing_ok=True)
+            continue
+        parts = _parts(unit, output)
+        inputs, record = digest(product.stage, parts), read_record(store, product.stage, unit.name)
+        if record is not None and record.inputs == inputs:
+            kept += 1
+            continue
+        failed = failed_inputs(store, product.stage, unit.name) == inputs
+        if failed and not retry:
+            aside.append(unit.name)
+            continue
+        why = AGAIN if failed else _why(store, product.stage, unit.name, record, parts)
+        if forget:
+            store.record(product.stage, unit.name).unlink(missing_ok=True)
+        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
+        waiting[unit.name] = unit.after
+    held = _held(waiting, {*blocked, *aside})
+    chosen = [
+        replace(task, after=tuple(tasks[other].index for other in waiting[name] if other in tasks))
+        for name, task in tasks.items()
+        if name not in held
+    ]
+    return Pending(chosen, kept, blocked + sorted(held), aside)
+
+
+def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
+    """Return what a unit depends on, by name: its settings, the version, and what it reads of each stage."""
+    read: dict[str, list[str | None]] = {}
+    for source in (*unit.inputs, *unit.optional):
+        read.setdefault(source[0], []).append(output(source))
+    return {"settings": digest(unit.settings), "version": version("romandask")} | {
+        stage: digest(found) for stage, found in read.items()
+    }
+
+
+def _why(store: Store, stage: str, name: str, record: Record | None, parts: dict[str, str]) -> str:
+    """Return why a unit is made."""
+    if record is None:
+        return "damaged record" if store.record(stage, name).exists() else "not there"
+    if not record.parts:
+        return "made by an earlier version"
+    changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
+    if changed == ["version"]:
+        return f"made by version {record.parts.get('version')}"
+    return f"changed: {', '.join(changed)}"
+
+
+def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
+    """Return the units that cannot be made because one that they come after cannot."""
+    held: set[str] = set()
+    while found := {name for name, after in waiting.items() if name not in held and set(after) & (missing | held)}:
+        held |= found
+    return held
+
+
+def drop_strays(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
+    """Remove the records of units that a stage no longer has, and the failures of those and of what is `made` now."""
+    names = set(product.names)
+    for path in store.records(product.stage):
+        if path.stem not in names:
+            path.unlink()
+    for path in failures(store, product.stage):
+        if path.stem not in names or path.stem in made:
+            path.unlink()
+
+
+def failures(store: Store, stage: str) -> list[Path]:
+    """Return the files that say why units of a stage failed."""
+    return sorted(store.record(stage, "x").parent.glob("*.failed"))
+
+
+def write_failure(store: Store, stage: str, unit: str, inputs: str, text: str) -> None:
+    """Write why a unit failed, and the hash of what it depends on: until that changes it stays set aside."""
+    write_bytes(store.record(stage, unit).with_suffix(".failed"), f"inputs {inputs}\n{text}".encode())
+
+
+def failed_inputs(store: Store, stage: str, unit: str) -> str | None:
+    """Return the hash of what a unit depended on when it failed; None where it has not failed."""
+    try:
+        first = store.record(stage, unit).with_suffix(".failed").read_text().split("\n", 1)[0]
+    except OSError:
+        return None
+    return first.removeprefix("inputs ")

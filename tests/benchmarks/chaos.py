@@ -1,0 +1,208 @@
+"""Faults at random: after each, the same command makes the same bytes as a clean run, and little of it twice.
+
+python tests/benchmarks/chaos.py [kills of the driver, 20] [kills of workers, 20] [damaged bytes and cuts, 200]
+
+A small survey of two telescopes on two workers. Needs the right to mount a tmpfs for the full and the read-only disk;
+without it these two are left out, and it says so.
+"""
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from conftest import MINI
+
+from romandask.model.seeds import rng
+from romandask.runtime.log import events
+from romandask.survey import open_survey
+from romandask.verification import verify
+
+WORKERS = 2
+RUN = (sys.executable, "-m", "romandask.cli", "run", "tiny", "--workers", str(WORKERS), *MINI)
+
+
+def start(store: Path) -> subprocess.Popen:
+    return subprocess.Popen([*RUN, "--store", str(store)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(store: Path, *more: str) -> tuple[int, str]:
+    done = subprocess.run([*RUN, "--store", str(store), *more], capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+def outputs(store: Path) -> dict[str, str]:
+    """Hash of every unit, from the manifest."""
+    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
+    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
+
+
+def twice(store: Path) -> int:
+    """How many units the logs of all runs have more than once."""
+    made = Counter(
+        f"{event['stage']}/{event['unit']}"
+        for path in (store / "log").glob("*.jsonl") for event in events(path) if event["event"] == "unit"
+    )  # fmt: skip
+    return sum(count - 1 for count in made.values())
+
+
+def children(pid: int) -> list[int]:
+    """The processes that a process has started, and theirs."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(path.read_text().rsplit(")", 1)[1].split()[1])
+        except OSError:
+            continue
+        if parent == pid:
+            found += [int(path.parent.name), *children(int(path.parent.name))]
+    return found
+
+
+def workers_of(pid: int) -> list[int]:
+    """The worker processes of a driver: what it spawned to run units."""
+    found = []
+    for child in children(pid):
+        try:
+            line = Path(f"/proc/{child}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if b"spawn_main" in line and b"resource_tracker" not in line:
+            found.append(child)
+    return found
+
+
+def kill_drivers(folder: Path, clean: dict[str, str], length: float, count: int, random: np.random.Generator) -> None:
+    """Kill the driver again and again on its way through one store, until it has been killed so often."""
+    killed, stores, lost, repeated = 0, 0, 0, 0
+    while killed < count:
+        store, stores = folder / f"driver-{stores}", stores + 1
+        here = 0
+        while killed < count:
+            driver = start(store)
+            try:
+                driver.communicate(timeout=float(random.uniform(6, length)))
+            except subprocess.TimeoutExpired:
+                os.kill(driver.pid, signal.SIGKILL)
+                driver.communicate()
+                killed, here = killed + 1, here + 1
+                continue
+            break
+        code, text = finish(store)
+        lost += code != 0 or outputs(store) != clean
+        if code:
+            print(text[-2000:])
+        repeated += twice(store)
+        shutil.rmtree(store)
+    print(
+        f"driver killed {killed} times in {stores} stores: {stores - lost} of {stores} as the clean run; "
+        f"{repeated} units made twice, {repeated / killed:.2f} a kill, {WORKERS} allowed"
+    )
+
+
+def kill_workers(folder: Path, clean: dict[str, str], count: int, random: np.random.Generator) -> None:
+    """Kill a worker now and then; the run goes on by itself."""
+    killed, stores, lost, repeated = 0, 0, 0, 0
+    while killed < count:
+        store, stores = folder / f"worker-{stores}", stores + 1
+        driver = start(store)
+        time.sleep(8)
+        while driver.poll() is None and killed < count:
+            time.sleep(float(random.uniform(2, 6)))
+            chosen = workers_of(driver.pid)
+            if chosen and driver.poll() is None:
+                os.kill(int(random.choice(chosen)), signal.SIGKILL)
+                killed += 1
+        text, _ = driver.communicate()
+        code = driver.returncode
+        if code:
+            print(text[-1500:])
+            code, _ = finish(store, "--retry-failed")
+        lost += code != 0 or outputs(store) != clean
+        repeated += twice(store)
+        shutil.rmtree(store)
+    print(
+        f"workers killed {killed} times in {stores} runs: {stores - lost} of {stores} as the clean run; "
+        f"{repeated} units in the logs twice"
+    )
+
+
+def damage(store: Path, count: int, random: np.random.Generator) -> None:
+    """Change a bit of a file or cut it, look whether it is found, and put it back."""
+    files = [path for path in sorted(store.rglob("*")) if path.is_file() and path.stat().st_size]
+    files = [path for path in files if path.relative_to(store).parts[0] not in ("report", "log", ".lock")]
+    kinds = Counter()
+    missed = []
+    for number in range(count):
+        path = files[int(random.integers(len(files)))]
+        content = path.read_bytes()
+        changed = bytearray(content)
+        place = int(random.integers(len(content)))
+        if number % 4 == 3:
+            changed = changed[:place]
+        else:
+            changed[place] ^= 1 << int(random.integers(8))
+        path.write_bytes(changed)
+        try:
+            found = [name for one in verify(open_survey(store), None) for name, _ in one.damaged]
+        except Exception as error:
+            found = [f"{type(error).__name__} at reading"]
+        if not found:
+            missed.append(str(path.relative_to(store)))
+        kinds[path.suffix or "chunk"] += 1
+        path.write_bytes(content)
+    print(f"{count} flips and cuts over {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
+
+
+def full_disk(folder: Path, clean: dict[str, str]) -> None:
+    """A disk of too few bytes, then one that may not be written, then room."""
+    disk = folder / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40m", "tmpfs", disk], check=False).returncode:
+        print("full disk: left out, a tmpfs cannot be mounted here")
+        return
+    try:
+        code, text = finish(disk / "s")
+        print(f"full disk: exit code {code}: {text.strip().splitlines()[-1]}")
+        assert "Traceback" not in text
+        kept = len(outputs(disk / "s"))
+        subprocess.run(["mount", "-o", "remount,ro,size=40m", disk], check=True)
+        code, text = finish(disk / "s")
+        print(f"read-only disk: exit code {code}: {text.strip().splitlines()[-1]}")
+        assert "Traceback" not in text
+        subprocess.run(["mount", "-o", "remount,rw,size=2g", disk], check=True)
+        code, text = finish(disk / "s")
+        same = outputs(disk / "s") == clean
+        print(f"room again: exit code {code}, {kept} units were kept, as the clean run: {same}")
+    finally:
+        subprocess.run(["umount", disk], check=False)
+
+
+def main(drivers: int, workers: int, flips: int) -> None:
+    random = rng(7, "chaos")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        began = time.perf_counter()
+        code, text = finish(folder / "clean")
+        length = time.perf_counter() - began
+        assert code == 0, text
+        clean = outputs(folder / "clean")
+        print(f"clean run: {len(clean)} units in {length:.0f} s\n  {shlex.join(RUN[3:])}")
+        full_disk(folder, clean)
+        damage(folder / "clean", flips, random)
+        kill_workers(folder, clean, workers, random)
+        kill_drivers(folder, clean, length, drivers, random)
+
+
+if __name__ == "__main__":
+    main(*(int(value) for value in (sys.argv[1:] + ["20", "20", "200"][len(sys.argv) - 1 :])))

@@ -1,0 +1,115 @@
+"""Images at the door: what other tools read from the files is what the store has."""
+
+import warnings
+
+import dask
+import numpy as np
+import pandas as pd
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
+from mocpy import MOC
+
+from romandask.export_images import export_fits, export_moc, export_obscore
+from romandask.instruments.exposure import exposure_of
+from romandask.model.errors import UserError
+from romandask.pointings import corners_of
+from romandask.survey import open_survey
+
+
+@pytest.fixture(scope="module")
+def survey(tiny_store):
+    with dask.config.set(scheduler="synchronous"):
+        yield open_survey(tiny_store)
+
+
+def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
+    """What astropy reads is what the store has, where the WCS of the store says."""
+    roman = survey.exposure_product("roman")
+    tile = survey.tiles[0].name
+    (one,) = export_fits(survey, tmp_path, "roman", [roman.names[1]], [], [])
+    (two,) = export_fits(survey, tmp_path, "rubin", [], [tile], ["i"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with fits.open(one, checksum=True) as hdus:
+            assert [hdu.name for hdu in hdus] == ["PRIMARY", "SCI", "ERR", "DQ"]
+            stored = roman.load(1)
+            np.testing.assert_array_equal(hdus["SCI"].data, stored["image"])
+            np.testing.assert_array_equal(hdus["DQ"].data, stored["dq"])
+            assert hdus["SCI"].header["BUNIT"] == "electron"
+            assert hdus["DQ"].header["BIT*"]
+            # of many empty pixels ERR is the scatter
+            sky = hdus["SCI"].data[:512, :512] - hdus[0].header["SKYMEAN"]
+            scatter = 1.4826 * np.median(np.abs(sky - np.median(sky)))
+            assert scatter == pytest.approx(np.median(hdus["ERR"].data[:512, :512]), rel=0.03)
+            assert scatter == pytest.approx(hdus[0].header["SKYERR"], rel=0.03)
+            at = WCS(hdus["ERR"].header).all_pix2world([[0, 0], [4087, 4000]], 0)
+            exposure = exposure_of(survey.pointings("roman").iloc[1])
+            expected = WCS(survey.instruments["roman"].header(exposure)).all_pix2world([[0, 0], [4087, 4000]], 0)
+            np.testing.assert_allclose(at, expected, rtol=0, atol=1e-12)
+        with fits.open(two, checksum=True) as hdus:
+            assert [hdu.name for hdu in hdus] == ["PRIMARY", "SCI", "ERR", "DQ", "WHT", "NIMAGES", "PSF"]
+            coadd = survey.coadds("rubin").sel(band="i").isel(tile=0)
+            np.testing.assert_array_equal(hdus["SCI"].data, coadd["image"])
+            np.testing.assert_array_equal(hdus["WHT"].data, coadd["weight"])
+            # these tiles have inverse variances
+            covered = hdus["WHT"].data > 0
+            error = hdus["ERR"].data[covered] * np.sqrt(hdus["WHT"].data[covered])
+            np.testing.assert_allclose(error, 1, rtol=0.02)
+            assert "CRVAL1" not in hdus["PSF"].header
+            assert WCS(hdus["SCI"].header).wcs.crval[0] == pytest.approx(float(coadd["ra"]))
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
+    with pytest.raises(UserError, match="nearest H158"):
+        export_fits(survey, tmp_path / "out", "roman", ["H158-999999-1"], [], [])
+    with pytest.raises(UserError, match="band 'H160'"):
+        export_fits(survey, tmp_path / "out", "roman", [], [survey.tiles[0].name], ["H160"])
+    with pytest.raises(UserError, match=r"\.vot, "):
+        export_obscore(survey, tmp_path / "out" / "images.csv")
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
+    roman, rubin = survey.coadd_product("roman"), survey.coadd_product("rubin")
+    exposures = survey.exposure_product("roman")
+    count = export_obscore(survey, tmp_path / "images.vot")
+    assert count == len(exposures.names) + len(roman.names) + len(rubin.names)
+    table = Table.read(tmp_path / "images.vot", format="votable")
+    assert set(table["obs_id"]) == {*exposures.names, *roman.names, *rubin.names}
+    assert len(set(table["obs_publisher_did"])) == count
+    one = table[table["obs_id"] == exposures.names[0]][0]
+    row = survey.pointings("roman").iloc[0]
+    assert one["t_min"] == row["mjd"]
+    assert one["t_exptime"] == row["exptime"]
+    polygon = np.array(one["s_region"].split()[2:], float).reshape(4, 2)
+    np.testing.assert_allclose(polygon, corners_of(survey.pointings("roman").iloc[:1])[0], atol=1e-6)
+    middle = SkyCoord(one["s_ra"], one["s_dec"], unit="deg")
+    assert middle.separation(SkyCoord(*polygon.mean(axis=0), unit="deg")).arcsec < 5
+    assert table["em_min"].unit == units.m
+    h158 = table[table["em_band"] == "H158"]
+    assert (h158["em_min"] < 1.45e-6).all()
+    assert (h158["em_max"] > 1.7e-6).all()
+    sharp = table[(table["instrument_name"] == "LSSTCam") & (table["em_band"] == "i")]
+    np.testing.assert_allclose(sharp["s_resolution"], 0.75, atol=0.15)
+    assert export_obscore(survey, tmp_path / "images.parquet") == count
+    assert len(pd.read_parquet(tmp_path / "images.parquet")) == count
+
+
+def test_maps_of_areas_hold_what_the_images_hold(survey, tmp_path):
+    paths = {path.name: path for path in export_moc(survey, tmp_path)}
+    roman = MOC.from_fits(paths["coadds-roman-H158.moc.fits"])
+    side = survey.pipeline.coadds.grid().side / 3600
+    # two neighbours share their overlap; cells at the edges stick out by half their 13 arcsec
+    union = (2 * side - 2 * survey.pipeline.coadds.overlap * survey.pipeline.coadds.scale / 3600) * side
+    area = roman.sky_fraction * 4 * np.pi * np.degrees(1) ** 2
+    assert union < area < union + 6 * side * 15 / 3600
+    objects = survey.objects("roman").compute()
+    assert roman.contains_lonlat(
+        objects["coord_ra"].to_numpy() * units.deg, objects["coord_dec"].to_numpy() * units.deg
+    ).all()
+    assert {"exposures-roman-F184.moc.fits", "coadds-rubin-u.moc.fits"} <= set(paths)

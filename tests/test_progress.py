@@ -1,0 +1,93 @@
+"""Progress as it is told: when a stage will be done, that nothing is long without a word, and the log of events."""
+
+import io
+import json
+import os
+import time
+
+import pytest
+from conftest import command
+from rich.console import Console
+
+from romandask.runtime import progress
+from romandask.runtime.lock import in_use, locked
+from romandask.runtime.log import Log, events, newest
+from romandask.runtime.progress import Pace, Reporter, duration
+
+
+def test_what_is_left_goes_by_cost_not_by_number():
+    """The dear units go first: after one of four, with nine tenths of the cost, a tenth is left."""
+    pace = Pace(units=4, cost=10.0, start=100.0)
+    assert pace.left(120.0) is None
+    pace.advance(9.0)
+    assert pace.left(190.0) == pytest.approx(10.0)
+    assert "1/4 units" in pace.text("coadds/roman", 190.0)
+    assert "about 10 s left" in pace.text("coadds/roman", 190.0)
+    for _ in range(3):
+        pace.advance(1 / 3)
+    assert "left" not in pace.text("coadds/roman", 200.0)
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(3.2, "3 s"), (89, "89 s"), (600, "10 min"), (9000, "2.5 h")])
+def test_times_as_one_reads_them(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_what_takes_long_says_that_it_goes_on(monkeypatch):
+    monkeypatch.setattr(progress, "QUIET", 0.3)
+    console = Console(file=io.StringIO(), width=200)
+    with Reporter(console).busy("planning"):
+        time.sleep(1.3)
+    lines = console.file.getvalue().splitlines()
+    assert 1 <= len(lines) <= 4
+    assert all(line.startswith("planning: ") for line in lines)
+
+
+def test_a_stage_without_a_finished_unit_says_that_it_goes_on(monkeypatch):
+    monkeypatch.setattr(progress, "QUIET", 0.3)
+    console = Console(file=io.StringIO(), width=200)
+    with Reporter(console).stage("coadds/roman", 2, 3.0) as meter:
+        time.sleep(0.9)
+        assert "0/2 units" in console.file.getvalue()
+        meter.advance(2.0)
+        meter.advance(1.0)
+    assert "2/2 units" in console.file.getvalue()
+
+
+def test_a_bar_counts_units(monkeypatch):
+    console = Console(file=io.StringIO(), force_terminal=True, width=100)
+    with Reporter(console).stage("coadds/roman", 2, 3.0) as meter:
+        meter.advance(2.0)
+        meter.advance(1.0)
+    assert "2/2" in console.file.getvalue()
+
+
+def test_a_log_that_was_cut_ends_before_the_cut(tmp_path):
+    log = Log(tmp_path / "log")
+    log.write("run", pipeline="x")
+    log.write("unit", stage="coadds/roman", unit="1-H158", seconds=2.5)
+    assert newest(tmp_path / "log") == log.path
+    found = list(events(log.path))
+    assert [one["event"] for one in found] == ["run", "unit"]
+    assert found[1]["seconds"] == 2.5
+    assert found[0]["time"] <= found[1]["time"]
+    with open(log.path, "ab") as file:
+        file.truncate(log.path.stat().st_size - 20)
+    assert [one["event"] for one in events(log.path)] == ["run"]
+    assert newest(tmp_path / "none") is None
+
+
+def test_a_store_is_in_use_while_its_driver_lives(tmp_path):
+    assert not in_use(tmp_path)
+    with locked(tmp_path):
+        assert in_use(tmp_path)
+        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
+    assert not in_use(tmp_path)
+    (tmp_path / ".lock").write_text('{"pid": 0}')
+    assert not in_use(tmp_path)
+
+
+def test_watching_what_is_no_store_is_a_mistake(tmp_path):
+    done = command("status", str(tmp_path), "--watch")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")

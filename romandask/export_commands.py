@@ -11,7 +11,7 @@ from rich.console import Console
 from romandask.arguments import Overrides, Source, StoreArgument
 from romandask.calibration import check_files, make_files
 from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth
-from romandask.export_images import export_fits, export_moc, export_obscore
+from romandask.export_images import export_asdf, export_fits, export_moc, export_obscore
 from romandask.instruments.roman_focal_plane import SCAS
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
@@ -58,6 +58,17 @@ def export_fits_images(
     if not exposure and not tile:
         raise UserError("export fits needs --exposure or --tile, one or more")
     for path in export_fits(found, out, survey, exposure or [], tile or [], band or []):
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@export_app.command("asdf")
+def export_asdf_images(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    exposure: Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")],
+) -> None:
+    """Write Roman exposures as level 2 images in ASDF, as roman_datamodels and romancal read them."""
+    for path in export_asdf(open_survey(store), out, exposure):
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

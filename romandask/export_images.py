@@ -12,11 +12,13 @@ import pandas as pd
 
 from romandask.export import prepare
 from romandask.exposures import empty_variance
-from romandask.formats import fits_image, obscore
+from romandask.formats import fits_image, obscore, roman_asdf
 from romandask.formats.fits_image import Plane
-from romandask.instruments.exposure import exposure_of
+from romandask.instruments.exposure import exposure_of, pixel_areas
+from romandask.kernels.detector import Detector
 from romandask.kernels.layer import errors, rms_of
 from romandask.model.errors import UserError
+from romandask.model.sky import ARCSEC
 from romandask.pointings import corners_of
 from romandask.runtime.images import ImageProduct
 from romandask.survey import Survey
@@ -85,10 +87,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
     electrons = arrays["image"].astype(np.float32)
 
     def error() -> np.ndarray:
-        if "variance" in arrays:
-            return np.sqrt(arrays["variance"])
-        # as a pipeline would know it: the electrons that were counted, those of the sky among them
-        return np.sqrt(np.maximum(electrons, 0) + np.float32(instrument.detector.read_noise**2))
+        return np.sqrt(arrays["variance"] if "variance" in arrays else _counted(electrons, instrument.detector))
 
     sky = instrument.background(exposure, header)
     primary = {
@@ -108,6 +107,11 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
         Plane("DQ", lambda: arrays["dq"], cards=_flags(product)),
     ]
     return header, primary, planes
+
+
+def _counted(image: np.ndarray, detector: Detector) -> np.ndarray:
+    """Return the variance as a pipeline would know it: the electrons that were counted, those of the sky among them."""
+    return np.maximum(image, 0).astype(np.float32) + np.float32(detector.read_noise**2)
 
 
 def _zero_point(bandpass: Any, seconds: float) -> float:
@@ -152,6 +156,42 @@ def _flags(product: ImageProduct) -> tuple[tuple[str, str], ...]:
     attributes = next(variable for variable in product.variables if variable.name == "dq").attributes
     masks, words = attributes.get("flag_masks", []), str(attributes.get("flag_meanings", "")).split()
     return tuple((f"BIT{int(mask).bit_length() - 1:02d}", word) for mask, word in zip(masks, words, strict=True))
+
+
+def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[Path]:
+    """Write Roman's exposures as level 2 images (roman_datamodels' ImageModel, electron/s with its sky).
+
+    Raises
+    ------
+    UserError
+        If the survey has no such exposure, it is not stored, or the package roman_datamodels is not there.
+    """
+    roman_asdf.available()
+    product = survey.exposure_product("roman")
+    chosen = _indices(product, exposures, "exposure")
+    flags = {word: 1 << int(card.removeprefix("BIT")) for card, word in _flags(product)}
+    prepare(folder)
+    written = []
+    for index in chosen:
+        source = source_of(product)
+        exposure, instrument = exposure_of(source.table.iloc[index]), source.instrument
+        header, arrays = instrument.header(exposure), product.load(index, ("image", "variance", "dq"))
+        rate = np.float32(1 / exposure.exptime)
+        variance = arrays["variance"] if "variance" in arrays else _counted(arrays["image"], instrument.detector)
+        light = np.maximum(arrays["image"], 0).astype(np.float32)
+        planes = {
+            "data": arrays["image"].astype(np.float32) * rate,
+            "err": np.sqrt(variance) * rate,
+            "var_poisson": light * rate**2,
+            "dq": arrays["dq"],
+        }
+        area = float(np.mean(pixel_areas(header, instrument.shape))) * ARCSEC**2
+        # AB: 3631 Jy give ab_photons electrons a second
+        photometry = 3631e-6 / instrument.bandpass(exposure.band).ab_photons() / area, area
+        path = folder / f"exposure-roman-{product.names[index]}.asdf"
+        roman_asdf.write(path, planes, flags, header, vars(exposure), photometry)
+        written.append(path)
+    return written
 
 
 def export_obscore(survey: Survey, path: Path) -> int:

@@ -9,7 +9,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from distributed import LocalCluster
 
+from romandask.model.errors import UserError
+from romandask.runtime import cluster
 from romandask.runtime.cluster import ATTEMPTS, runner
 from romandask.runtime.order import Waiting
 from romandask.runtime.store import Store
@@ -96,3 +99,25 @@ def test_dear_tasks_come_first_and_none_before_what_it_comes_after():
     tasks = [Task(0, "", 1.0, "x"), Task(1, "", 5.0, "y"), Task(2, "", 3.0, "x", after=(0,)), Task(3, "", 2.0, "z")]
     waiting = Waiting(tasks)
     assert [waiting.next().index for _ in tasks] == [1, 0, 2, 3]
+
+
+def test_workers_that_die_before_they_begin_are_started_again(monkeypatch):
+    """Twice in a row is bad luck; always is told in one line."""
+    starts = []
+
+    class Dying(LocalCluster):
+        def __init__(self, **kwargs):
+            starts.append(kwargs["n_workers"])
+            if len(starts) < 3:
+                raise RuntimeError("Nanny failed to start.")
+            super().__init__(**kwargs)
+
+    monkeypatch.setattr(cluster, "LocalCluster", Dying)
+    with runner(1, 1.5) as execution:
+        assert "1 local workers" in execution.description
+    assert starts == [1, 1, 1]
+    monkeypatch.setattr(cluster, "ATTEMPTS", 2)
+    starts.clear()
+    with pytest.raises(UserError, match="Nanny failed to start"), runner(1, 1.5):
+        pass
+    assert starts == [1, 1]

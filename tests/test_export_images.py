@@ -6,6 +6,7 @@ import dask
 import numpy as np
 import pandas as pd
 import pytest
+import roman_datamodels as rdm
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
@@ -13,7 +14,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from mocpy import MOC
 
-from romandask.export_images import export_fits, export_moc, export_obscore
+from romandask.export_images import export_asdf, export_fits, export_moc, export_obscore
 from romandask.instruments.exposure import exposure_of
 from romandask.model.errors import UserError
 from romandask.pointings import corners_of
@@ -61,6 +62,39 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
             np.testing.assert_allclose(error, 1, rtol=0.02)
             assert "CRVAL1" not in hdus["PSF"].header
             assert WCS(hdus["SCI"].header).wcs.crval[0] == pytest.approx(float(coadd["ra"]))
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
+    """roman_datamodels reads and validates them; their gwcs is the FITS WCS; a star has the flux that it had."""
+    product = survey.exposure_product("roman")
+    (path,) = export_asdf(survey, tmp_path, [product.names[1]])
+    stored, exposure = product.load(1), exposure_of(survey.pointings("roman").iloc[1])
+    instrument = survey.instruments["roman"]
+    with rdm.open(path) as model:
+        assert isinstance(model, rdm.datamodels.ImageModel)
+        model.validate()
+        np.testing.assert_allclose(model.data * exposure.exptime, stored["image"], rtol=1e-6, atol=1e-3)
+        assert model.meta.instrument.optical_element == exposure.band.replace("H158", "F158")
+        assert model.meta.instrument.detector == f"WFI{exposure.detector:02d}"
+        assert model.meta.exposure.exposure_time == exposure.exptime
+        grid = np.linspace(0, 4087, 40)
+        x, y = np.meshgrid(grid, grid)
+        wcs = WCS(instrument.header(exposure))
+        ra, dec = model.meta.wcs(x, y)
+        expected = wcs.all_pix2world(x.ravel(), y.ravel(), 0)
+        np.testing.assert_allclose(ra.ravel(), expected[0], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(dec.ravel(), expected[1], rtol=0, atol=1e-10)
+        saturated = (stored["dq"] & 1) > 0
+        flag = int(rdm.dqflags.pixel.SATURATED)
+        np.testing.assert_array_equal((np.asarray(model.dq) & flag) > 0, saturated)
+        scatter = model.data[:512, :512]
+        spread = 1.4826 * np.median(np.abs(scatter - np.median(scatter)))
+        assert spread == pytest.approx(float(np.median(model.err[:512, :512])), rel=0.03)
+        # 20 AB mag are 3631e-8 Jy
+        photons = instrument.bandpass(exposure.band).ab_photons() * 1e-8
+        light = photons * model.meta.photometry.conversion_megajanskys * model.meta.photometry.pixel_area
+        assert light * 1e6 == pytest.approx(3631e-8, rel=1e-6)
     assert not list(tmp_path.glob(".*"))
 
 

@@ -267,18 +267,31 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
     settings = yaml.safe_load((resource_folder("pipelines") / "cluster" / "workers.yaml").read_text())
     with (
         dask.config.set(dask.config.merge({"distributed": dask.config.get("distributed")}, settings)),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=f"127.0.0.1:{_free_port(8787)}",
-            memory_limit=int(memory_limit * 2**30),
-            silence_logs=50,
-        ) as cluster,
+        _local_cluster(workers, int(memory_limit * 2**30)) as cluster,
         Client(cluster) as client,
     ):
         yield OnCluster(client, f"{workers} local workers, dashboard {cluster.dashboard_link}")
+
+
+def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
+    """Start processes of one thread on the loopback; again where one dies before it has begun."""
+    reason = ""
+    for _ in range(ATTEMPTS):
+        try:
+            return LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=f"127.0.0.1:{_free_port(8787)}",
+                memory_limit=memory_limit,
+                silence_logs=50,
+            )
+        except RuntimeError as error:
+            reason = str(error.__cause__ or error)
+    raise UserError(
+        f"{workers} local workers cannot be started ({reason}): free memory or processes, or run with --workers 0"
+    )
 
 
 def _check_workers(client: Client, scheduler: str, memory_limit: float) -> None:

@@ -96,11 +96,13 @@ def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float
     figure = figure_of(15.0, 7.6)
     axes = figure.subplots(2, 4).ravel()
     edges = np.arange(14, 32.1, 0.5)
+    # nothing has no logarithm
+    counted = "log" if len(galaxies) else "linear"
     for band in bands[:4]:
         for frame, line in ((galaxies, "-"), (stars, ":")):
             counts, _ = np.histogram(ab_magnitude(frame[f"flux_{band}"]), edges)
             axes[0].stairs(counts / area / 0.5, edges, linestyle=line, label=band if line == "-" else None)
-    axes[0].set(yscale="log", xlabel="AB mag", ylabel="a mag and arcmin$^2$", title="Counts (dotted: stars)")
+    axes[0].set(yscale=counted, xlabel="AB mag", ylabel="a mag and arcmin$^2$", title="Counts (dotted: stars)")
     axes[0].legend(fontsize=8)
     axes[1].hist(galaxies["redshift"], np.arange(0, 3.2, 0.1), histtype="step")
     axes[1].set(xlabel="redshift", title="Galaxies")
@@ -112,20 +114,21 @@ def input_distributions(galaxies: pd.DataFrame, stars: pd.DataFrame, area: float
         major, minor = (galaxies.loc[rows, f"size_{axis}{name}_true"] for axis in ("", "minor_"))
         axes[3].hist(np.sqrt(major * minor), np.geomspace(0.01, 10, 50), histtype="step", label=name)
         axes[4].hist((major - minor) / (major + minor), np.arange(0, 1, 0.03), histtype="step", label=name)
-    axes[2].set(yscale="log", xlabel="magnorm", title="Brightness by component")
+    axes[2].set(yscale=counted, xlabel="magnorm", title="Brightness by component")
     axes[3].set(xscale="log", xlabel="half-light radius, arcsec", title="Sizes")
     axes[4].set(xlabel="(a - b) / (a + b)", title="Shapes before lensing")
     for each in axes[2:5]:
         each.legend(fontsize=8)
-    first, last = bands[0], bands[-1]
+    first, last, colours = bands[0], bands[-1], np.arange(-2, 6, 0.15)
     for frame, name in ((galaxies, "galaxies"), (stars, "stars")):
         colour = ab_magnitude(frame[f"flux_{first}"]) - ab_magnitude(frame[f"flux_{last}"])
-        axes[5].hist(colour, np.arange(-2, 6, 0.15), histtype="step", density=True, label=name)
+        shares = np.histogram(colour, colours)[0] / max(1, len(colour)) / np.diff(colours)
+        axes[5].stairs(shares, colours, label=name)
     axes[5].set(xlabel=f"{first} - {last}", title="Colours")
     axes[5].legend(fontsize=8)
     axes[6].hist(galaxies["convergence"], 60, histtype="step", label="$\\kappa$")
     axes[6].hist(np.hypot(galaxies["shear_1"], galaxies["shear_2"]), 60, histtype="step", label="$|\\gamma|$")
-    axes[6].set(yscale="log", title="Lensing")
+    axes[6].set(yscale=counted, title="Lensing")
     axes[6].legend(fontsize=8)
     some = galaxies["n_knots"] > 0
     axes[7].hist(galaxies.loc[some, "n_knots"], np.arange(0, 33, 1), histtype="step")

@@ -260,3 +260,4 @@ def test_a_survey_that_finds_nothing_still_ends_with_a_report(tmp_path):
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, *empty, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "data:image/png" in (tmp_path / "s" / "report" / "index.html").read_text()
+    assert "Warning" not in done.stderr

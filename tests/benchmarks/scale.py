@@ -6,13 +6,14 @@ Every unit of every stage of `troxel2023` is found, hashed, handed to two worker
 left out. What this takes is overhead: beside it stands the time that the plan projects for the work.
 """
 
-import pickle
 import resource
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+import cloudpickle
 
 from romandask.pipeline import load_pipeline
 from romandask.runtime.cluster import runner
@@ -65,7 +66,7 @@ def main(overrides: list[str]) -> None:
             failed = [outcome.failure for outcome in outcomes if outcome.record is None]
             assert not failed, failed[0]
             total, count = total + found + ran, count + len(outcomes)
-            size = len(pickle.dumps(product)) / 1e6
+            size = len(cloudpickle.dumps(product)) / 1e6
             each = 1000 * ran / max(1, len(outcomes))
             print(
                 f"{stage.name:24s} {len(outcomes):8d} {found:7.1f} s {ran:6.1f} s {each:6.1f} ms {size:6.1f} MB",

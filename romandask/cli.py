@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import sys
@@ -30,7 +29,7 @@ from romandask.report import dag_svg, write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
 from romandask.runtime.lock import in_use  # noqa: E402
 from romandask.runtime.progress import Reporter, duration  # noqa: E402
-from romandask.runtime.store import Store  # noqa: E402
+from romandask.runtime.store import FULL, Store  # noqa: E402
 from romandask.survey import Survey, open_survey  # noqa: E402
 
 app = typer.Typer(
@@ -220,7 +219,7 @@ def main() -> None:
         app()
     except OSError as error:
         # a disk that is full, or may not be written, is met wherever something is written
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        if error.errno not in FULL:
             raise
         print(f"error: {error.filename}: {error.strerror}: make room; the same command resumes", file=sys.stderr)
         sys.exit(2)

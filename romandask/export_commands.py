@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -20,15 +21,19 @@ from romandask.survey import Survey, open_survey
 
 export_app = typer.Typer(no_args_is_help=True, help="Write a survey's contents in other formats.")
 calibration_app = typer.Typer(no_args_is_help=True, help="Calibration files of Roman's detectors.")
+Folder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")]
+Exposures = Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")]
+
+
+def _wrote(paths: Iterable[Path]) -> None:
+    for path in paths:
+        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
 @export_app.command("truth")
-def export_truth_files(
-    store: StoreArgument, out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")]
-) -> None:
+def export_truth_files(store: StoreArgument, out: Folder) -> None:
     """Write the truth as galaxies.fits and stars.fits, and its spectra as seds.hdf5."""
-    for path in export_truth(open_survey(store), out):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_truth(open_survey(store), out))
 
 
 @export_app.command("obseq")
@@ -45,7 +50,7 @@ def export_visits(
 @export_app.command("fits")
 def export_fits_images(
     store: StoreArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    out: Folder,
     survey: Annotated[str, typer.Option("--survey", help="roman or rubin.")] = "roman",
     exposure: Annotated[list[str] | None, typer.Option("--exposure", help="Name; may be repeated.")] = None,
     tile: Annotated[list[str] | None, typer.Option("--tile", help="Name; may be repeated.")] = None,
@@ -57,19 +62,17 @@ def export_fits_images(
         raise UserError(f"--survey {survey}: this survey has {', '.join(found.instruments)}")
     if not exposure and not tile:
         raise UserError("export fits needs --exposure or --tile, one or more")
-    for path in export_fits(found, out, survey, exposure or [], tile or [], band or []):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_fits(found, out, survey, exposure or [], tile or [], band or []))
 
 
 @export_app.command("asdf")
 def export_asdf_images(
     store: StoreArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
-    exposure: Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")],
+    out: Folder,
+    exposure: Exposures,
 ) -> None:
     """Write Roman exposures as level 2 images in ASDF, as roman_datamodels and romancal read them."""
-    for path in export_asdf(open_survey(store), out, exposure):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_asdf(open_survey(store), out, exposure))
 
 
 @export_app.command("obscore")
@@ -83,29 +86,25 @@ def export_obscore_table(
 
 
 @export_app.command("moc")
-def export_area_maps(
-    store: StoreArgument, out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")]
-) -> None:
+def export_area_maps(store: StoreArgument, out: Folder) -> None:
     """Write where exposures and tiles lie on the sky, a MOC (FITS) each product and band."""
-    for path in export_moc(open_survey(store), out):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_moc(open_survey(store), out))
 
 
 @export_app.command("psf")
 def export_psf_images(
     store: StoreArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
-    exposure: Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")],
+    out: Folder,
+    exposure: Exposures,
 ) -> None:
     """Write PSF images of Roman exposures (FITS): a unit star, 8 samples a pixel."""
-    for path in export_psf(open_survey(store), out, exposure):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_psf(open_survey(store), out, exposure))
 
 
 @export_app.command("coadd-psf")
 def export_coadd_psf_images(
     store: StoreArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    out: Folder,
     at: Annotated[tuple[float, float], typer.Option("--at", metavar="RA DEC", help="Degrees.")],
     band: Annotated[list[str] | None, typer.Option("--band", help="May be repeated; default: all.")] = None,
     scale: Annotated[
@@ -114,14 +113,13 @@ def export_coadd_psf_images(
     ] = None,
 ) -> None:
     """Write the PSF of Roman's coadds at a place: a unit star as the exposures there have it, drizzled (FITS)."""
-    for path in export_coadd_psf(open_survey(store), out, *at, band or [], scale):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_coadd_psf(open_survey(store), out, *at, band or [], scale))
 
 
 @export_app.command("meds")
 def export_meds_files(
     store: StoreArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    out: Folder,
     ids: Annotated[list[int] | None, typer.Option("--id", help="Id of an object; may be repeated.")] = None,
     cone: Annotated[
         tuple[float, float, float] | None,
@@ -135,19 +133,17 @@ def export_meds_files(
     if (ids is None) == (cone is None):
         raise UserError("export meds needs --id (one or more) or --cone, not both")
     of = Cone(*cone) if cone is not None else ids or []
-    for path in export_meds(open_survey(store), out, of, band or [], size, catalog):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(export_meds(open_survey(store), out, of, band or [], size, catalog))
 
 
 @calibration_app.command("make")
 def calibration_make(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")],
+    out: Folder,
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same files from the same seed.")] = 0,
     sca: Annotated[list[int] | None, typer.Option("--sca", help="SCA, 1-18; may be repeated; default: all.")] = None,
 ) -> None:
     """Make calibration files of made-up detectors, with the statistics of the real ones: 1.6 GB an SCA."""
-    for path in make_files(out, seed, sca or SCAS):
-        Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+    _wrote(make_files(out, seed, sca or SCAS))
 
 
 @calibration_app.command("check")

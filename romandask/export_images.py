@@ -104,7 +104,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
     planes = [
         Plane("SCI", lambda: electrons, "electron"),
         Plane("ERR", error, "electron"),
-        Plane("DQ", lambda: arrays["dq"], cards=_flags(product)),
+        Plane("DQ", lambda: arrays["dq"], cards=_cards(product)),
     ]
     return header, primary, planes
 
@@ -143,7 +143,7 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
     planes = [
         Plane("SCI", lambda: plane("image"), "nJy"),
         Plane("ERR", error, "nJy"),
-        Plane("DQ", lambda: plane("dq"), cards=_flags(product)),
+        Plane("DQ", lambda: plane("dq"), cards=_cards(product)),
         Plane("WHT", lambda: plane("weight"), str(weight.attributes["units"])),
         Plane("NIMAGES", lambda: plane("nimages")),
         Plane("PSF", lambda: plane("psf"), on_sky=False, cards=(("PIXSCALE", scale),)),
@@ -151,11 +151,16 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
     return maker.header(tile), primary, planes
 
 
-def _flags(product: ImageProduct) -> tuple[tuple[str, str], ...]:
-    """Return a card a bit of dq: what it means."""
+def _flags(product: ImageProduct) -> dict[str, int]:
+    """Return the bits of dq by what they mean."""
     attributes = next(variable for variable in product.variables if variable.name == "dq").attributes
     masks, words = attributes.get("flag_masks", []), str(attributes.get("flag_meanings", "")).split()
-    return tuple((f"BIT{int(mask).bit_length() - 1:02d}", word) for mask, word in zip(masks, words, strict=True))
+    return dict(zip(words, masks, strict=True))
+
+
+def _cards(product: ImageProduct) -> tuple[tuple[str, str], ...]:
+    """Return a card a bit of dq: what it means."""
+    return tuple((f"BIT{int(mask).bit_length() - 1:02d}", word) for word, mask in _flags(product).items())
 
 
 def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[Path]:
@@ -169,7 +174,7 @@ def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[
     roman_asdf.available()
     product = survey.exposure_product("roman")
     chosen = _indices(product, exposures, "exposure")
-    flags = {word: 1 << int(card.removeprefix("BIT")) for card, word in _flags(product)}
+    flags = _flags(product)
     prepare(folder)
     written = []
     for index in chosen:

@@ -110,13 +110,14 @@ class Store:
             ) from None
 
 
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+"""Errors of a disk that takes no more."""
 
 
 def refuse_full(error: BaseException | None, store: Store) -> None:
     """Raise a UserError where an error, or what led to it, says that the store's disk can take no more."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _FULL:
+        if isinstance(error, OSError) and error.errno in FULL:
             raise UserError(f"{store.root}: {os.strerror(error.errno)}: make room; the same command resumes") from None
         error = error.__cause__ or error.__context__
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import xarray as xr
 from romandask.cutouts import Wanted, located
 from romandask.formats import meds, obseq, psf_image, truth_files
 from romandask.model.errors import UserError
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.tables import TableProduct
 from romandask.survey import Survey
 
@@ -68,19 +69,15 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
         If the survey has no such exposure, or the folder cannot be written.
     """
     product = survey.psf_product("roman")
-    places = {name: index for index, name in enumerate(product.names)}
-    for name in names:
-        if name not in places:
-            close = difflib.get_close_matches(name, places, n=1, cutoff=0.0)
-            raise UserError(f"exposure {name!r}: this survey has {len(places)}, nearest {', '.join(close) or 'none'}")
+    indices = indices_of(product, names, "exposure", "this survey")
     prepare(folder)
     attributes = product.variables[0].attributes
     table = survey.pointings("roman")
     written = []
-    for name in names:
+    for name, index in zip(names, indices, strict=True):
         path = folder / f"psf-{name}.fits"
-        image = product.load(places[name])["psf"]
-        row = table.iloc[places[name]].to_dict()
+        image = product.load(index)["psf"]
+        row = table.iloc[index].to_dict()
         psf_image.write(path, image, attributes["oversampling"], attributes["pixel_scale"], row)
         written.append(path)
     return written
@@ -158,6 +155,16 @@ def _blocks(found: xr.Dataset) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
 def _parts(product: TableProduct) -> Iterator[pd.DataFrame]:
     for index in range(len(product.names)):
         yield product.load(index)
+
+
+def indices_of(product: ImageProduct, names: Sequence[str], kind: str, holder: str) -> list[int]:
+    """Return the units of some names; UserError, with the nearest name, where the holder has none of it."""
+    places = {name: index for index, name in enumerate(product.names)}
+    for name in names:
+        if name not in places:
+            close = difflib.get_close_matches(name, places, n=1, cutoff=0.0)
+            raise UserError(f"{kind} {name!r}: {holder} has {len(places)}, nearest {', '.join(close) or 'none'}")
+    return [places[name] for name in names]
 
 
 def prepare(folder: Path) -> None:

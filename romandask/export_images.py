@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from romandask.export import prepare
+from romandask.export import indices_of, prepare
 from romandask.exposures import empty_variance
 from romandask.formats import fits_image, obscore, roman_asdf
 from romandask.formats.fits_image import Plane
@@ -69,14 +68,11 @@ def export_fits(
 
 
 def _indices(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:
-    places = {name: index for index, name in enumerate(product.names)}
-    for name in names:
-        if name not in places:
-            close = difflib.get_close_matches(name, places, n=1, cutoff=0.0)
-            raise UserError(f"{kind} {name!r}: {product.stage} has {len(places)}, nearest {', '.join(close) or 'none'}")
-        if not product.has(places[name]):
-            raise UserError(f"{product.stage} {name} is not stored: run the survey first")
-    return [places[name] for name in names]
+    indices = indices_of(product, names, kind, product.stage)
+    for index in indices:
+        if not product.has(index):
+            raise UserError(f"{product.stage} {product.names[index]} is not stored: run the survey first")
+    return indices
 
 
 def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
@@ -234,15 +230,8 @@ def _rows(survey: Survey, name: str, product: ImageProduct) -> pd.DataFrame:
     side, scale = product.variables[0].shape, instrument.coadd_scale if of_tiles else instrument.pixel_scale
     rows = []
     for index in stored:
-        if of_tiles:
-            here = tile_maker(product).unit(index)
-            seen, band = table.iloc[here.members], here.band
-            corners = here.tile.corners(tile_maker(product).settings.grid().side)
-            seconds = float(seen["exptime"].sum()) if len(seen) else 0.0
-        else:
-            seen = table.iloc[[index]]
-            band, corners = str(seen["band"].iloc[0]), corners_of(seen)[0]
-            seconds = float(seen["exptime"].iloc[0])
+        seen, band, corners = _seen(product, table, index)
+        seconds = float(seen["exptime"].sum())
         wave = instrument.bandpass(band).wave
         ends = seen["mjd"] + seen["exptime"] / 86400
         rows.append(
@@ -272,6 +261,16 @@ def _rows(survey: Survey, name: str, product: ImageProduct) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _seen(product: ImageProduct, table: pd.DataFrame, index: int) -> tuple[pd.DataFrame, str, np.ndarray]:
+    """Return the exposures (rows of the pointings) of which an image is made, its band, its corners (4, 2; degrees)."""
+    if product.stage.startswith("coadds"):
+        maker = tile_maker(product)
+        here = maker.unit(index)
+        return table.iloc[here.members], here.band, here.tile.corners(maker.settings.grid().side)
+    seen = table.iloc[[index]]
+    return seen, str(seen["band"].iloc[0]), corners_of(seen)[0]
+
+
 def _fwhm(psf: np.ndarray) -> float:
     """Return the diameter, pixels, of a circle as large as what is above half the peak; NaN without a PSF."""
     return float(2 * np.sqrt((psf > psf.max() / 2).sum() / np.pi)) if psf.max() > 0 else np.nan
@@ -287,12 +286,17 @@ def export_moc(survey: Survey, folder: Path) -> list[Path]:
     """
     written = []
     for name in survey.instruments:
+        table = survey.pointings(name)
         for product in _images(survey, name):
-            rows = _rows(survey, name, product)
+            polygons: dict[str, list[np.ndarray]] = {}
+            for index in range(len(product.names)):
+                if product.has(index):
+                    _, band, corners = _seen(product, table, index)
+                    polygons.setdefault(band, []).append(corners)
             prepare(folder)
-            for band, part in rows.groupby("band") if len(rows) else ():
+            for band, found in sorted(polygons.items()):
                 path = folder / f"{product.stage.replace('/', '-')}-{band}.moc.fits"
-                obscore.write_moc(path, list(part["corners"]), AREA_ORDER)
+                obscore.write_moc(path, found, AREA_ORDER)
                 written.append(path)
     if not written:
         raise UserError("no image is stored yet: run the survey first")

@@ -47,13 +47,17 @@ def outputs(store: Path) -> dict[str, str]:
     return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
 
 
-def twice(store: Path) -> int:
-    """How many units the logs of all runs have more than once."""
-    made = Counter(
+def made(store: Path) -> Counter[str]:
+    """How often each unit was made, from the logs of all runs."""
+    return Counter(
         f"{event['stage']}/{event['unit']}"
         for path in (store / "log").glob("*.jsonl") for event in events(path) if event["event"] == "unit"
     )  # fmt: skip
-    return sum(count - 1 for count in made.values())
+
+
+def twice(store: Path) -> int:
+    """How many units the logs of all runs have more than once."""
+    return sum(count - 1 for count in made(store).values())
 
 
 def children(pid: int) -> list[int]:
@@ -116,9 +120,11 @@ def kill_workers(folder: Path, clean: dict[str, str], count: int, random: np.ran
     while killed < count:
         store, stores = folder / f"worker-{stores}", stores + 1
         driver = start(store)
-        time.sleep(8)
+        # the start of the cluster has its own test: here units are in flight
+        while driver.poll() is None and not made(store):
+            time.sleep(0.5)
         while driver.poll() is None and killed < count:
-            time.sleep(float(random.uniform(2, 6)))
+            time.sleep(float(random.uniform(1, 5)))
             chosen = workers_of(driver.pid)
             if chosen and driver.poll() is None:
                 os.kill(int(random.choice(chosen)), signal.SIGKILL)
@@ -132,8 +138,8 @@ def kill_workers(folder: Path, clean: dict[str, str], count: int, random: np.ran
         repeated += twice(store)
         shutil.rmtree(store)
     print(
-        f"workers killed {killed} times in {stores} runs: {stores - lost} of {stores} as the clean run; "
-        f"{repeated} units in the logs twice"
+        f"workers killed {killed} times in {stores} runs, units in flight: {stores - lost} of {stores} as the clean "
+        f"run; {repeated} units in the logs twice"
     )
 
 

@@ -5,19 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from romandask.model.errors import UserError
+from romandask.places import Place, place_of
 
 
-def _folder(text: str) -> Path:
-    """Return a folder: an address would become one that is named as it is."""
-    if "://" in text:
-        raise UserError(f"{text}: a store is a folder of this machine, or one that is mounted on it; addresses are not")
-    return Path(text)
+def source_of(text: str) -> Place:
+    """Return the place of something that is read."""
+    return place_of(text, "a source")
 
 
 Source = Annotated[
@@ -26,14 +23,19 @@ Source = Annotated[
 Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
 ]
-Place = Annotated[Path, typer.Option("--store", metavar="FOLDER", parser=_folder, help="Folder of the store.")]
+StoreOption = Annotated[
+    Any, typer.Option("--store", metavar="FOLDER", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+]
 Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
 ]
-StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", parser=_folder, help="Folder of the store.")]
+StoreArgument = Annotated[
+    Any, typer.Argument(metavar="STORE", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+]
 Spectra = Annotated[
-    Path | None, typer.Option("--seds", help="Folder of the spectra that are named; default: seds beside SRC.")
+    Any,
+    typer.Option("--seds", parser=source_of, help="Folder of the spectra that are named; default: seds beside SRC."),
 ]
 Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
 

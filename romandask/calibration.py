@@ -15,8 +15,8 @@ from romandask.instruments.roman_focal_plane import SCAS
 from romandask.kernels.sca import STIMULI
 from romandask.kernels.synthetic_sca import WAVES
 from romandask.model.errors import UserError
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import Coordinates, ImageProduct
-from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 
 BYTES = 1_600_000_000

@@ -23,7 +23,7 @@ from romandask.kernels.ccd import (
 from romandask.kernels.cosmic_rays import hits, tracks
 from romandask.kernels.detector import SATURATED
 from romandask.model.seeds import rng
-from romandask.runtime.store import Variable
+from romandask.runtime.arrays import Variable
 
 
 @dataclass(frozen=True)

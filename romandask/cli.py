@@ -19,7 +19,7 @@ from rich.live import Live  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
 from romandask import flow, stages, verification  # noqa: E402
-from romandask.arguments import Overrides, Place, Scheduler, Source, StoreArgument, Workers, resumable  # noqa: E402
+from romandask.arguments import Overrides, Scheduler, Source, StoreArgument, StoreOption, Workers, resumable  # noqa: E402
 from romandask.export_commands import calibration_app, export_app  # noqa: E402
 from romandask.ingest_commands import ingest_app  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
@@ -90,7 +90,7 @@ def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
 @app.command()
 def run(
     pipeline: Source,
-    store: Place,
+    store: StoreOption,
     overrides: Overrides = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -111,7 +111,7 @@ def run(
     reporter = Reporter(Console())
     with reporter.busy("planning"):
         planned = stages.plan(Survey(settings))
-    place, chosen = Store(store.resolve()), stages.Chosen(tuple(only or ()), start)
+    place, chosen = Store(store), stages.Chosen(tuple(only or ()), start)
     if dry_run or explain:
         with reporter.busy("finding what there is to do"):
             _explain(Survey(settings, place), chosen, retry, reporter)

@@ -21,10 +21,10 @@ from romandask.model.config import CoaddSettings
 from romandask.model.sky import touching_pairs
 from romandask.model.tiles import Tile
 from romandask.pointings import corners_of
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import Coordinates, ImageProduct
 from romandask.runtime.manifest import digest
 from romandask.runtime.schemas import schema
-from romandask.runtime.store import Variable
 from romandask.runtime.units import LazyUnits, Unit
 from romandask.tile_maker import TileMaker, source_of
 from romandask.warped_tiles import WarpTile

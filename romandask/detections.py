@@ -23,11 +23,11 @@ from romandask.kernels.photometry import extinction
 from romandask.model.config import DetectionSettings
 from romandask.model.sky import Region, cells_in_cone, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
+from romandask.runtime.arrays import Variable
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
 from romandask.runtime.schemas import schema
-from romandask.runtime.store import Variable
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands

@@ -13,9 +13,9 @@ from romandask.kernels.detector import SATURATED
 from romandask.kernels.difference import Matched, blurred, dipoles, match, matching_kernel
 from romandask.kernels.pixel_map import PixelMap, pixel_map
 from romandask.model.config import DifferenceSettings
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.schemas import schema
-from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 from romandask.tile_layers import TileBands
 from romandask.tile_maker import TileMaker, tile_maker

@@ -30,10 +30,11 @@ from romandask.model.seeds import rng
 from romandask.model.sky import radec, unit_vectors
 from romandask.pointings import corners_of
 from romandask.readout import ScaReadout, before, trapped_table
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import Coordinates, ImageProduct, table_beside
 from romandask.runtime.manifest import read_record
 from romandask.runtime.schemas import schema
-from romandask.runtime.store import Store, Variable, read_parquet
+from romandask.runtime.store import Store, read_parquet
 from romandask.runtime.tables import to_frame
 from romandask.runtime.units import LazyUnits, Unit
 from romandask.truth import TruthCatalogs

@@ -11,16 +11,17 @@ from importlib.metadata import version
 
 from romandask.incoming import source_rows
 from romandask.pipeline import Pipeline
+from romandask.places import files_below, write_bytes
 from romandask.runtime.cluster import Runner
 from romandask.runtime.hats import write_catalog_files
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
-from romandask.runtime.log import Log, events, newest
-from romandask.runtime.manifest import read_record
+from romandask.runtime.log import Log, newest_event
+from romandask.runtime.manifest import read_record, read_records
 from romandask.runtime.pending import Pending, drop_strays, failures, pending, write_failure
 from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
-from romandask.runtime.store import Store, refuse_full, write_bytes, write_json
+from romandask.runtime.store import Store, refuse_full, write_json
 from romandask.runtime.work import Task
 from romandask.stages import Chosen, Product, Stage, stages
 from romandask.survey import Survey
@@ -174,7 +175,7 @@ def _make_stage(stage: Stage, this: Run) -> None:
     _run_stage(stage, product, todo, this)
     if stage.name == "truth/galaxies":
         write_spectra(this.survey.truth_catalogs, this.store)
-        seal(this.store, "truth/seds", sorted(this.store.images("truth/seds").rglob("*")))
+        seal(this.store, "truth/seds", files_below(this.store.images("truth/seds")))
 
 
 def _run_stage(stage: Stage, product: Product, todo: Pending, this: Run) -> None:
@@ -188,7 +189,7 @@ def _run_stage(stage: Stage, product: Product, todo: Pending, this: Run) -> None
         unseal(store, stage.name)
         product.prepare(store)
         if not summary.begun:
-            this.ends.enter_context(this.runner.recording(this.log.path.with_suffix(".html")))
+            this.ends.enter_context(this.runner.recording(this.log.beside(".html")))
         summary.begun += len(todo.tasks)
         this.log.write("stage", stage=stage.name, make=len(todo.tasks), keep=todo.kept, blocked=len(todo.blocked))
         made = _make_units(stage, product, todo.tasks, this)
@@ -239,7 +240,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     rows = []
     for stage in stages(survey):
         failed = len(failures(store, stage.name))
-        done = len(store.records(stage.name))
+        done = len(store.recorded(stage.name))
         known = stage.name.startswith(("truth/", "pointings/"))
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
@@ -252,11 +253,9 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
 def last_event(survey: Survey) -> str:
     """Return one line about what the newest run of a store did last; empty where none has been logged."""
     assert survey.store is not None
-    path = newest(survey.store.log)
-    found = list(events(path)) if path else []
-    if not found:
+    last = newest_event(survey.store.log)
+    if last is None:
         return ""
-    last = found[-1]
     what = {
         "run": "it began, on {on}",
         "stage": "{stage}: {make} units to make",
@@ -270,9 +269,8 @@ def last_event(survey: Survey) -> str:
 def run_figures(store: Store) -> list[dict]:
     """Return, a stage, units, seconds of work, bytes, rows and the largest memory of a worker, from the manifest."""
     rows = []
-    for folder in sorted(path for path in (store.root / "manifest").glob("*/*") if path.is_dir()):
-        stage = f"{folder.parent.name}/{folder.name}"
-        records = [record for path in store.records(stage) if (record := read_record(store, stage, path.stem))]
+    for stage in store.stages():
+        records = [record for _, record in read_records(store, stage) if record]
         if records:
             rows.append(
                 {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,10 +17,11 @@ from romandask.model.config import TruthSettings
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass, SpectrumLibrary
+from romandask.places import Place
+from romandask.runtime.arrays import Variable
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
-from romandask.runtime.store import Variable
 from romandask.runtime.units import Unit
 
 _NO_BINS = np.zeros(0, np.float32)
@@ -39,7 +39,7 @@ class Templates:
 
 
 @lru_cache(maxsize=4)
-def templates(star_folder: Path | None) -> Templates:
+def templates(star_folder: Place | None) -> Templates:
     """Return the library: galaxy templates, then blackbodies or a folder of stars by their colour temperature.
 
     Raises

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from romandask.model.config import TruthSettings
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, SpectrumLibrary
+from romandask.places import Place, below
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
@@ -28,7 +28,7 @@ SPECTRA = ("bulge_sed", "disk_sed", "knots_sed", "sed")
 _BATCH_BYTES = 600 << 20
 
 
-def open_sources(settings: TruthSettings, data: Path) -> tuple[Source, ...]:
+def open_sources(settings: TruthSettings, data: Place) -> tuple[Source, ...]:
     """Return the source catalogs that the settings name, checked.
 
     Raises
@@ -37,12 +37,12 @@ def open_sources(settings: TruthSettings, data: Path) -> tuple[Source, ...]:
         Naming the file, column or key that is missing or wrong.
     """
     if settings.source == "skycatalogs":
-        return (skycatalogs.open_source(data / str(settings.path)),)
+        return (skycatalogs.open_source(below(data, str(settings.path))),)
     if settings.source == "instance_catalog":
-        return (instance_catalog.open_source(data / str(settings.path)),)
+        return (instance_catalog.open_source(below(data, str(settings.path))),)
     tables = {"galaxy": settings.galaxy_table, "star": settings.star_table}
     return tuple(
-        table.open_source(data / each.path, dict(each.columns), kind)
+        table.open_source(below(data, each.path), dict(each.columns), kind)
         for kind, each in tables.items()
         if each is not None
     )

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from romandask import flow
-from romandask.arguments import Order, Place, Spectra, Workers, resumable
+from romandask.arguments import Order, Spectra, StoreOption, Workers, resumable, source_of
 from romandask.model.config import read_yaml
 from romandask.model.errors import UserError
 from romandask.pipeline import pipeline_of
+from romandask.places import Place, below
 from romandask.runtime.cluster import runner
 from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
@@ -23,37 +23,41 @@ ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a
 
 @ingest_app.command()
 def skycatalogs(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of skyCatalogs files, or its YAML file.")],
-    store: Place,
+    source: Annotated[
+        Any, typer.Argument(metavar="SRC", parser=source_of, help="Folder of skyCatalogs files, or its YAML.")
+    ],
+    store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
     workers: Workers = 0,
 ) -> None:
     """Bring skyCatalogs in as HATS catalogs, with fluxes in all ten bands; bad rows go to quarantine."""
-    _ingest(source, {"source": "skycatalogs", "path": str(source.resolve())}, store, seds, order, workers)
+    _ingest(source, {"source": "skycatalogs", "path": str(source)}, store, seds, order, workers)
 
 
 @ingest_app.command("instance-catalog")
 def instance_catalog(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="A phoSim instance catalog, text or .gz.")],
-    store: Place,
+    source: Annotated[Any, typer.Argument(metavar="SRC", parser=source_of, help="A phoSim instance catalog, or .gz.")],
+    store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
     workers: Workers = 0,
 ) -> None:
     """Bring a DC2 instance catalog in: components of one galaxy become one row, shears are given the on-sky sign."""
-    _ingest(source, {"source": "instance_catalog", "path": str(source.resolve())}, store, seds, order, workers)
+    _ingest(source, {"source": "instance_catalog", "path": str(source)}, store, seds, order, workers)
 
 
 @ingest_app.command()
 def table(
     columns: Annotated[
-        Path,
+        Any,
         typer.Argument(
-            metavar="MAP", help="YAML with sections galaxies and stars, each with path and columns (ours: the file's)."
+            metavar="MAP",
+            parser=source_of,
+            help="YAML with sections galaxies and stars, each with path and columns (ours: the file's).",
         ),
     ],
-    store: Place,
+    store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
     workers: Workers = 0,
@@ -67,7 +71,7 @@ def table(
     for section, key in (("galaxies", "galaxy_table"), ("stars", "star_table")):
         if isinstance(sections.get(section), dict) and "path" in sections[section]:
             # as the map's author sees it
-            path = columns.resolve().parent / str(sections[section]["path"])
+            path = below(columns.parent, str(sections[section]["path"]))
             content[key] = sections[section] | {"path": str(path)}
         elif section in sections:
             raise UserError(f"{columns}: section {section} must hold path and columns")
@@ -75,18 +79,18 @@ def table(
 
 
 def _ingest(
-    source: Path, truth: dict[str, Any], store: Path, seds: Path | None, order: int, workers: int | None
+    source: Place, truth: dict[str, Any], store: Place, seds: Place | None, order: int, workers: int | None
 ) -> None:
     content = {
         "name": "ingest",
         "seed": 0,
         "region": {"ra": [0, 360], "dec": [-90, 90]},
-        "truth": {**truth, "order": order, "seds": str((seds or source.resolve().parent / "seds").resolve())},
+        "truth": {**truth, "order": order, "seds": str(seds or source.parent / "seds")},
         "roman": {},
         "rubin": {},
     }
     settings = pipeline_of(content, str(source))
-    place = Store(store.resolve())
+    place = Store(store)
     survey = Survey(settings)
     survey.incoming_product  # noqa: B018  opened, so that a wrong source is known before anything is written
     place.prepare()

@@ -29,6 +29,7 @@ from romandask.model.config import (
 )
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
+from romandask.places import Place, below, place_of, reached
 
 
 class Pipeline(Section):
@@ -70,14 +71,14 @@ class Pipeline(Section):
         if self.roman is None or self.roman.detector == "simple":
             return None
         folder = self.roman.calibration
-        return CalibrationSource(None if folder is None else Path(self.data) / folder, self.seed)
+        return CalibrationSource(None if folder is None else below(place_of(self.data), folder), self.seed)
 
     def to_yaml(self) -> str:
         """Return the resolved settings as YAML."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
 
 
-def load_pipeline(source: str | Path, overrides: list[str] | None = None) -> Pipeline:
+def load_pipeline(source: str | Place, overrides: list[str] | None = None) -> Pipeline:
     """Return the settings of a YAML file, or of a pipeline that came with the package, with overrides applied.
 
     Raises
@@ -85,11 +86,12 @@ def load_pipeline(source: str | Path, overrides: list[str] | None = None) -> Pip
     UserError
         Naming the file and every key that is unknown (with the nearest valid one), missing or wrong.
     """
-    path = Path(source)
-    content = apply_overrides(read_yaml(_find(path)), overrides or [])
+    found = _find(source)
+    with reached(found):
+        content = apply_overrides(read_yaml(found), overrides or [])
     settings: Pipeline = validate(Pipeline, content, str(source))
     # workers, and whoever opens the store later, need not share this working directory
-    return settings.model_copy(update={"data": str(Path(settings.data).resolve())})
+    return settings.model_copy(update={"data": str(place_of(settings.data, "data"))})
 
 
 def pipeline_of(content: dict[str, Any], source: str) -> Pipeline:
@@ -102,7 +104,10 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in resource_folder("pipelines").glob("*.yaml"))
 
 
-def _find(path: Path) -> Path:
+def _find(source: str | Place) -> Place:
+    if "://" in str(source):
+        return place_of(source, "a pipeline")
+    path = Path(str(source))
     if path.is_file():
         return path
     inside = resource_folder("pipelines") / f"{path.name.removesuffix('.yaml')}.yaml"

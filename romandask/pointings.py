@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,13 +12,14 @@ from romandask.instruments.exposure import EXPOSURE_COLUMNS, Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile
+from romandask.places import Place, below, reached
 
-READERS: dict[str, Callable[[Path], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
+READERS: dict[str, Callable[[Place], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
 
 
 def pointings(
-    instrument: Instrument, settings, data: Path, region: Region, tiles: list[Tile], side: float, seed: int
+    instrument: Instrument, settings, data: Place, region: Region, tiles: list[Tile], side: float, seed: int
 ) -> pd.DataFrame:
     """Return the exposures whose footprints touch a tile, by visit and detector (schema: catalogs/pointings.yaml).
 
@@ -34,7 +34,9 @@ def pointings(
         If the file cannot be read, or no exposure touches the region in one of the bands.
     """
     every = visits(instrument, settings, data, region, seed)
-    origin = f"{instrument.name}.pointings ({settings.source})" if settings.path is None else str(data / settings.path)
+    origin = (
+        f"{instrument.name}.pointings ({settings.source})" if settings.path is None else str(below(data, settings.path))
+    )
     every = every[every["band"].isin(instrument.bands)]
     corners = np.stack([tile.corners(side) for tile in tiles])
     near = every[_near(every, corners, instrument.field_radius)]
@@ -56,13 +58,14 @@ def pointings(
     return rows
 
 
-def visits(instrument: Instrument, settings, data: Path, region: Region, seed: int) -> pd.DataFrame:
+def visits(instrument: Instrument, settings, data: Place, region: Region, seed: int) -> pd.DataFrame:
     """Return all visits of the observing sequence, whether or not they touch the region."""
     if settings.source not in READERS:
         return instrument.plan(region, seed)
     if not settings.path:
         raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
-    return READERS[settings.source](data / settings.path)
+    with reached(data):
+        return READERS[settings.source](below(data, settings.path))
 
 
 def corners_of(table: pd.DataFrame) -> np.ndarray:

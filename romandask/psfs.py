@@ -10,8 +10,8 @@ from romandask.exposures import RenderExposure
 from romandask.instruments.exposure import Exposure, Instrument, exposure_of
 from romandask.kernels.psf import fine_image
 from romandask.model.spectra import Bandpass, ab_photon_density
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import ImageProduct
-from romandask.runtime.store import Variable
 from romandask.runtime.units import LazyUnits, Unit
 
 OVERSAMPLING = 8

@@ -31,8 +31,8 @@ from romandask.kernels.sca_exposure import (
 )
 from romandask.kernels.synthetic_sca import SIDE, WAVES
 from romandask.model.seeds import rng
+from romandask.runtime.arrays import ROWS_A_FILE
 from romandask.runtime.images import ImageProduct
-from romandask.runtime.store import ROWS_A_FILE
 
 DAY = 86400.0
 """Seconds."""

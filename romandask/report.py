@@ -17,6 +17,7 @@ from romandask.joint_report import blends, difference_images, field
 from romandask.lensing import significance
 from romandask.model.spectra import ab_magnitude
 from romandask.page import image_of, table_of
+from romandask.places import Place, bytes_below, write_bytes
 from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.stages import Planned
@@ -48,7 +49,7 @@ th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align
 """
 
 
-def write_report(survey: Survey) -> Path:
+def write_report(survey: Survey) -> Place:
     """Write the page of a stored survey and return where it is."""
     assert survey.store is not None
     objects = {name: survey.object_product(name).all_rows() for name in survey.instruments}
@@ -70,8 +71,7 @@ def write_report(survey: Survey) -> Path:
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     )
     path = survey.store.report / "index.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page + "".join(sections) + "</html>\n")
+    write_bytes(path, (page + "".join(sections) + "</html>\n").encode())
     return path
 
 
@@ -301,7 +301,7 @@ def _figures_of_the_run(survey: Survey) -> str:
             "warnings": figures["warnings"],
         }
     )
-    disk = sum(path.stat().st_size for path in survey.store.root.rglob("*") if path.is_file())
+    disk = bytes_below(survey.store.root)
     versions = ", ".join(f"{name} {number}" for name, number in stored_versions(survey.store).items())
     return (
         "<h2>The run</h2>"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
 import dask.dataframe as dd
@@ -16,8 +15,9 @@ from romandask.matches import group_of
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.pipeline import load_pipeline
+from romandask.places import Place, place_of, reached
 from romandask.pointings import visits
-from romandask.runtime.manifest import read_record
+from romandask.runtime.manifest import read_records
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.star import Spectrum, coadd_psf
@@ -216,10 +216,8 @@ class Survey(SurveyProducts):
         place = self.store.root if self.store else "not stored"
         lines = [f"Survey {self.pipeline.name} ({place})"]
         if self.store:
-            for folder in sorted(path for path in (self.store.root / "manifest").glob("*/*") if path.is_dir()):
-                stage = f"{folder.parent.name}/{folder.name}"
-                paths = self.store.records(stage)
-                records = [record for path in paths if (record := read_record(self.store, stage, path.stem))]
+            for stage in self.store.stages():
+                records = [record for _, record in read_records(self.store, stage) if record]
                 size = sum(record.bytes for record in records)
                 lines.append(f"  {stage:20s} {len(records):6d} units {size / 1e6:12.1f} MB")
         return "\n".join(lines)
@@ -263,15 +261,17 @@ def _with_group(groups: pd.DataFrame, merged: pd.DataFrame, length: float) -> pd
     return groups.assign(group=group_of(groups, merged, length))
 
 
-def open_survey(path: str | Path) -> Survey:
-    """Open a stored survey.
+def open_survey(path: str | Place) -> Survey:
+    """Open a stored survey: its folder, or s3://BUCKET/FOLDER.
 
     Raises
     ------
     UserError
-        If the folder is not a store.
+        If it is not a store, or cannot be reached.
     """
-    store = Store(Path(path).resolve())
-    if not store.pipeline.is_file():
+    store = Store(place_of(path))
+    with reached(store.root):
+        there = store.pipeline.is_file()
+    if not there:
         raise UserError(f"{path}: not a romandask store (it has no pipeline.yaml); make one with romandask run")
     return Survey(load_pipeline(store.pipeline), store)

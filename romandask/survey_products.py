@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -23,6 +22,7 @@ from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline
+from romandask.places import Place, below, place_of, reached, state_of
 from romandask.pointings import pointings
 from romandask.psfs import psfs
 from romandask.runtime.images import ImageProduct
@@ -76,14 +76,16 @@ class SurveyProducts:
         }
 
     @property
-    def data(self) -> Path:
+    def data(self) -> Place:
         """The folder that source files are below."""
-        return Path(self.pipeline.data)
+        return place_of(self.pipeline.data, "data")
 
     @cached_property
     def incoming_product(self) -> TableProduct:
         """The rows of the source catalogs, where truth is not generated."""
-        return self._stored(incoming(open_sources(self.pipeline.truth, self.data)))
+        with reached(self.data):
+            sources = open_sources(self.pipeline.truth, self.data)
+        return self._stored(incoming(sources))
 
     @cached_property
     def truth_catalogs(self) -> TruthCatalogs:
@@ -284,9 +286,9 @@ class _MakePointings:
         return SurveyProducts(self._pipeline).make_pointings(self._name)
 
 
-def _state(data: Path, path: str | None):
+def _state(data: Place, path: str | None):
     """Return what identifies the content of a source file without reading it."""
     if path is None:
         return None
-    file = data / path
-    return (path, file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else (path,)
+    file = below(data, path)
+    return (path, *state_of(file)) if file.is_file() else (path,)

@@ -11,9 +11,9 @@ from romandask.instruments.exposure import Instrument
 from romandask.kernels.extract import psf_scatter
 from romandask.kernels.layer import Layer, errors, median, noise_ratios, rms_of, weighted_mean
 from romandask.model.spectra import NJY_ZERO_POINT
+from romandask.runtime.arrays import chunk_side
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
-from romandask.runtime.store import chunk_side
 
 Window = tuple[slice, ...]
 """Rows and columns of a plane."""

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import zarr
 from scipy.spatial import cKDTree
 
 from romandask.formats import spectra as spectra_files
@@ -20,10 +18,12 @@ from romandask.kernels.scene import Truth, bind
 from romandask.model.config import TruthSettings
 from romandask.model.sky import Region, cell_area, cells_in_cone, unit_vectors
 from romandask.model.spectra import Bandpass, SpectrumLibrary
+from romandask.places import Place, below
+from romandask.runtime.arrays import write_coordinate, write_group
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import digest
 from romandask.runtime.schemas import schema
-from romandask.runtime.store import Store, write_coordinate
+from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 
@@ -101,7 +101,7 @@ def _rows_near(
 
 def truth(
     settings: TruthSettings,
-    data: Path,
+    data: Place,
     region: Region,
     bandpasses: dict[str, Bandpass],
     seed: int,
@@ -131,13 +131,13 @@ def truth(
 
 def _generated(
     settings: TruthSettings,
-    data: Path,
+    data: Place,
     region: Region,
     bandpasses: dict[str, Bandpass],
     seed: int,
     store: Store | None,
 ) -> TruthCatalogs:
-    spectra = templates(data / settings.star_seds if settings.star_seds else None)
+    spectra = templates(below(data, settings.star_seds) if settings.star_seds else None)
     cells = region.cells(settings.order, settings.margin)
     field = _kept(matter(settings, region, seed), store)
     common = (settings, region, bandpasses, seed, spectra, cells)
@@ -164,14 +164,14 @@ def _generated(
 
 def _from_sources(
     settings: TruthSettings,
-    data: Path,
+    data: Place,
     region: Region,
     bandpasses: dict[str, Bandpass],
     store: Store | None,
     rows: TableProduct,
 ) -> TruthCatalogs:
     found = contents(rows, settings.order)
-    folder = data / (settings.seds or "seds")
+    folder = below(data, settings.seds or "seds")
     library, unusable = spectra_files.read_folder(folder, list(found.spectra))
     edges = edges_of(rows)
     # components of a galaxy that lie apart across an edge are each looked at where they are
@@ -232,7 +232,7 @@ def _tables(
 
 def write_spectra(catalogs: TruthCatalogs, store: Store) -> None:
     """Write truth/seds.zarr: the library that the catalogs' `*_sed` columns index, and the edges of top-hat bins."""
-    group = zarr.open_group(store.images("truth/seds"), mode="a")
+    group = write_group(store.images("truth/seds"), "a")
     library = catalogs.library
     write_coordinate(group, "wave", library.wave, ("wave",), {"units": "nm", "long_name": "rest-frame wavelength"})
     text = {"long_name": "photon density over that at 500 nm"}

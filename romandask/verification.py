@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
+from romandask.places import remove, remove_folder
 from romandask.runtime.images import ImageProduct
-from romandask.runtime.manifest import read_record
+from romandask.runtime.manifest import Record, read_records
 from romandask.runtime.sealed import broken, unseal
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
@@ -42,16 +41,16 @@ def verify(survey: Survey, only: str | None = None) -> Iterator[Verified]:
     for stage in stages(survey):
         if only is not None and stage.name != only:
             continue
-        paths = store.records(stage.name)
-        if not paths:
+        records = dict(read_records(store, stage.name))
+        if not records:
             continue
         product, found = stage.product(survey), []
         numbers = {name: index for index, name in enumerate(product.names)}
-        for path in paths:
-            why = _damage(product, store, numbers, path)
+        for name, record in records.items():
+            why = _damage(product, store, numbers, name, record)
             if why is not None:
-                found.append((path.stem, why))
-        yield Verified(stage.name, len(paths), tuple(found + broken(store, stage.name)))
+                found.append((name, why))
+        yield Verified(stage.name, len(records), tuple(found + broken(store, stage.name)))
     for name in BESIDE:
         if only in (None, name):
             yield Verified(name, 0, tuple(broken(store, name)))
@@ -68,28 +67,29 @@ def forget(survey: Survey, found: Verified) -> None:
     beside = {name for name, _ in broken(store, found.stage)}
     for name, _ in found.damaged:
         if name not in beside:
-            store.record(found.stage, name).unlink(missing_ok=True)
+            remove(store.record(found.stage, name))
     if not beside:
         return
     unseal(store, found.stage)
     for name in beside:
-        (store.root / name).unlink(missing_ok=True)
+        remove(store.root / name)
     if store.images(found.stage).exists():
-        shutil.rmtree(store.images(found.stage))
-        for path in store.records(found.stage):
-            path.unlink()
-    (store.catalog(found.stage) / "hats.properties").unlink(missing_ok=True)
+        remove_folder(store.images(found.stage))
+        for name in store.recorded(found.stage):
+            remove(store.record(found.stage, name))
+    remove(store.catalog(found.stage) / "hats.properties")
 
 
-def _damage(product: ImageProduct | TableProduct, store: Store, numbers: dict[str, int], path: Path) -> str | None:
+def _damage(
+    product: ImageProduct | TableProduct, store: Store, numbers: dict[str, int], name: str, record: Record | None
+) -> str | None:
     """Return what is wrong with a unit; None where nothing is."""
-    record = read_record(store, product.stage, path.stem)
     if record is None:
-        return f"{path}: the record is damaged"
-    if path.stem not in numbers:
+        return f"{store.record(product.stage, name)}: the record is damaged"
+    if name not in numbers:
         return "the survey has no such unit any more"
     try:
-        output = product.verify(numbers[path.stem], store)
+        output = product.verify(numbers[name], store)
     except Exception as error:
         # whatever a decoder makes of damaged bytes
         return f"cannot be read ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})"

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from romandask.runtime import progress
 from romandask.runtime.lock import in_use, locked
-from romandask.runtime.log import Log, events, newest
+from romandask.runtime.log import Log, events, newest_event, runs
 from romandask.runtime.progress import Pace, Reporter, duration
 
 
@@ -66,15 +66,17 @@ def test_a_log_that_was_cut_ends_before_the_cut(tmp_path):
     log = Log(tmp_path / "log")
     log.write("run", pipeline="x")
     log.write("unit", stage="coadds/roman", unit="1-H158", seconds=2.5)
-    assert newest(tmp_path / "log") == log.path
-    found = list(events(log.path))
+    assert runs(tmp_path / "log") == [log.name]
+    found = list(events(tmp_path / "log", log.name))
     assert [one["event"] for one in found] == ["run", "unit"]
     assert found[1]["seconds"] == 2.5
     assert found[0]["time"] <= found[1]["time"]
-    with open(log.path, "ab") as file:
-        file.truncate(log.path.stat().st_size - 20)
-    assert [one["event"] for one in events(log.path)] == ["run"]
-    assert newest(tmp_path / "none") is None
+    assert newest_event(tmp_path / "log") == found[1]
+    path = tmp_path / "log" / f"{log.name}.jsonl"
+    with open(path, "ab") as file:
+        file.truncate(path.stat().st_size - 20)
+    assert [one["event"] for one in events(tmp_path / "log", log.name)] == ["run"]
+    assert newest_event(tmp_path / "none") is None
 
 
 def test_a_store_is_in_use_while_its_driver_lives(tmp_path):

@@ -40,6 +40,7 @@ LAYERS = [
     {"generated", "incoming", "calibration"},
     {"instruments", "runtime"},
     {"formats"},
+    {"places"},
     {"kernels"},
     {"model"},
 ]

@@ -12,10 +12,12 @@ import pytest
 import zarr
 
 from romandask.model.errors import UserError
+from romandask.places import write_bytes
+from romandask.runtime.arrays import Variable
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
 from romandask.runtime.manifest import Record, digest, read_record, write_record
-from romandask.runtime.store import Store, Variable, read_parquet, write_bytes, write_parquet
+from romandask.runtime.store import Store, read_parquet, write_parquet
 from romandask.runtime.tables import TableProduct, conform
 from romandask.runtime.units import LazyUnits, Unit, names_of
 

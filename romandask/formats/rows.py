@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 import zlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
+
+from romandask.places import Place, state_of
 
 COMPONENTS = ("bulge", "disk", "knots")
 BANDS = "ugrizy"
@@ -46,12 +47,12 @@ _NO_BINS = np.zeros(0, np.float32)
 class Batch:
     """A part of a file that one task reads."""
 
-    path: Path
+    path: Place
     start: int
     """First row (tables) or byte (text)."""
     stop: int
     key: str = ""
-    """Path of the file relative to the source, with slashes; the file's name where empty."""
+    """Place of the file relative to the source, with slashes; the file's name where empty."""
 
     @property
     def source(self) -> str:
@@ -87,10 +88,9 @@ class Source(Protocol):
         """Return the rows of the source, None if only reading tells."""
 
 
-def file_state(paths: dict[str, Path]) -> dict[str, list[int]]:
+def file_state(paths: dict[str, Place]) -> dict[str, list[int]]:
     """Return by key the bytes and the time of change (ns) of files."""
-    stats = {key: path.stat() for key, path in sorted(paths.items())}
-    return {key: [stat.st_size, stat.st_mtime_ns] for key, stat in stats.items()}
+    return {key: state_of(path) for key, path in sorted(paths.items())}
 
 
 def normal_form(source: str, row: np.ndarray, kind: str | np.ndarray, columns: dict[str, Any]) -> pd.DataFrame:

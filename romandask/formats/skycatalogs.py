@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from cdshealpix import from_ring
 from romandask.formats import parquet
 from romandask.formats.rows import COMPONENTS, FLUXES, MAX_ROWS, Batch, file_state, normal_form, with_reasons
 from romandask.model.errors import UserError
+from romandask.places import Place
 
 TEMPLATES = {
     "galaxy": "galaxy_(?P<healpix>\\d+).parquet",
@@ -58,7 +58,7 @@ TOPHAT_ROWS = 100_000
 class File:
     """A file of one HEALPix pixel."""
 
-    path: Path
+    path: Place
     kind: str
     """galaxy, star or trilegal"""
     order: int
@@ -67,7 +67,7 @@ class File:
     """The pixel, nested."""
     pixel: int
     """The pixel as the file's name has it."""
-    flux: Path | None
+    flux: Place | None
     """File of Rubin fluxes of the same objects."""
 
 
@@ -126,7 +126,7 @@ class Source:
         return with_reasons(frame, len(self.edges) - 1, repeated)
 
 
-def open_source(folder: Path, rows: int = MAX_ROWS) -> Source:
+def open_source(folder: Place, rows: int = MAX_ROWS) -> Source:
     """Return the files of a folder, their columns checked.
 
     Parameters
@@ -172,7 +172,7 @@ def open_source(folder: Path, rows: int = MAX_ROWS) -> Source:
 class _Loader(yaml.SafeLoader):
     """Safe YAML with `!include file`, files below one folder."""
 
-    folder: Path
+    folder: Place
     depth: int
 
     def include(self, node: yaml.ScalarNode) -> Any:
@@ -185,7 +185,7 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("!include", _Loader.include)
 
 
-def _read_config(path: Path, folder: Path, depth: int = 0) -> dict[str, Any]:
+def _read_config(path: Place, folder: Place, depth: int = 0) -> dict[str, Any]:
     try:
         loader = _Loader(path.read_text())
         loader.folder, loader.depth = folder, depth
@@ -201,7 +201,7 @@ def _read_config(path: Path, folder: Path, depth: int = 0) -> dict[str, Any]:
     return content
 
 
-def _configuration(folder: Path) -> tuple[Path, Path]:
+def _configuration(folder: Place) -> tuple[Place, Place]:
     if folder.is_file():
         return folder, folder.parent
     if not folder.is_dir():
@@ -218,7 +218,7 @@ def _configuration(folder: Path) -> tuple[Path, Path]:
     return found[0], folder
 
 
-def _edges(config: Path, content: dict[str, Any]) -> tuple[float, ...]:
+def _edges(config: Place, content: dict[str, Any]) -> tuple[float, ...]:
     """Return the edges of the top-hat bins; until schema 1.2 under SED_models, later under the galaxies."""
     for place in (content.get("SED_models"), (content.get("object_types") or {}).get("galaxy")):
         if isinstance(place, dict) and "tophat" in place:
@@ -234,7 +234,7 @@ def _edges(config: Path, content: dict[str, Any]) -> tuple[float, ...]:
     raise UserError(f"{config}: key SED_models.tophat (bins, units) is missing or not as skyCatalogs writes it")
 
 
-def _files(folder: Path, config: Path, name: str, section: Any, content: dict[str, Any]) -> dict[str, File]:
+def _files(folder: Place, config: Place, name: str, section: Any, content: dict[str, Any]) -> dict[str, File]:
     kind = KINDS[name]
     template = section.get("file_template", TEMPLATES[kind].replace("trilegal", name))
     partition = section.get("area_partition") or content.get("area_partition") or {}
@@ -381,7 +381,8 @@ def _shifted(file: File, ids: np.ndarray) -> np.ndarray:
 
 def _fluxes(file: File, batch: Batch, ids: np.ndarray) -> dict[str, np.ndarray]:
     """Return the fluxes of a batch's objects, joined by id: mostly the same rows of the flux file, else wherever."""
-    path = Path(str(file.flux))
+    path = file.flux
+    assert path is not None
     column, pattern = _identifier(file)
     names = [name for name in FLUXES if name in parquet.schema(path).names]
     total = parquet.count(path)

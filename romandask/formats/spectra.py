@@ -13,6 +13,7 @@ from astropy.modeling.physical_models import BlackBody
 
 from romandask.model.errors import UserError
 from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
+from romandask.places import Place, local
 
 BLACKBODY = re.compile(r"blackbody_(\d{3,6})")
 YOUNG = "flat_fnu"
@@ -63,14 +64,14 @@ def joined(*libraries: SpectrumLibrary) -> SpectrumLibrary:
     )
 
 
-def every_file(folder: Path) -> list[str]:
+def every_file(folder: Place) -> list[str]:
     """Return the files of a folder of spectra, by their paths below it."""
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder of spectra")
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def read_folder(folder: Path, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
+def read_folder(folder: Place, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
     """Return a library of the named spectra (paths below the folder) and, by name, why others are not in it.
 
     blackbody_<K> is a blackbody of that temperature and needs no file.
@@ -92,7 +93,8 @@ def read_folder(folder: Path, names: list[str]) -> tuple[SpectrumLibrary, dict[s
             reasons[name] = "SED not in the library"
             continue
         try:
-            with gzip.open(path, "rt") if path.suffix == ".gz" else open(path) as file:
+            here = local(path)
+            with gzip.open(here, "rt") if here.suffix == ".gz" else open(here) as file:
                 wave, flambda = np.loadtxt(file, unpack=True)[:2]
             library_from([name], [(wave, flambda)], np.array([400.0, 500.0]))
         except (OSError, EOFError, ValueError):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pandas as pd
 
 from romandask.model.errors import UserError
+from romandask.places import Place
 
 RANGES = {
     "ra": (-360.0, 720.0),
@@ -18,7 +17,7 @@ RANGES = {
 """Of our columns: what is beyond them is in other units, or no visit."""
 
 
-def check_ranges(visits: pd.DataFrame, path: Path, names: dict[str, str]) -> None:
+def check_ranges(visits: pd.DataFrame, path: Place, names: dict[str, str]) -> None:
     """Check that every visit points at the sky for some time.
 
     Parameters

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,14 @@ from romandask.formats.calibration import TABLE, check, path_of, read
 from romandask.kernels.synthetic_sca import charge_diffusion, planes
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
+from romandask.places import Place, state_of
 
 
 @dataclass(frozen=True)
 class CalibrationSource:
     """The calibrations of all SCAs."""
 
-    folder: Path | None
+    folder: Place | None
     """Of files sca01.fits to sca18.fits; None for made-up SCAs."""
     seed: int
     """Of those."""
@@ -69,7 +69,7 @@ class CalibrationSource:
         path = path_of(self.folder, sca)
         if not path.is_file():
             return str(path)
-        return str(path), path.stat().st_size, path.stat().st_mtime_ns
+        return (str(path), *state_of(path))
 
 
 @lru_cache(maxsize=18)

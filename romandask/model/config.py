@@ -211,7 +211,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         text = path.read_text()
         content = yaml.load(text, _Loader)
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         where = getattr(error, "problem_mark", None)
         line = f" at line {where.line + 1}" if where else ""

@@ -18,6 +18,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import dask
@@ -26,10 +27,11 @@ from distributed import Client, LocalCluster, performance_report
 
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
+from romandask.places import Place, write_bytes
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record
 from romandask.runtime.order import Waiting
-from romandask.runtime.store import Store, write_bytes
+from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.work import Task, make_unit
 
@@ -63,7 +65,7 @@ class Runner(Protocol):
     def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
         """Yield what became of each unit, as they end."""
 
-    def recording(self, path: Path) -> AbstractContextManager[Any]:
+    def recording(self, path: Place) -> AbstractContextManager[Any]:
         """Write, at the end of the context, a page with what the cluster did in it."""
 
 
@@ -72,7 +74,7 @@ class InProcess:
 
     description = "in this process"
 
-    def recording(self, path: Path) -> AbstractContextManager[Any]:
+    def recording(self, path: Place) -> AbstractContextManager[Any]:
         """Write nothing: there is no cluster."""
         return nullcontext()
 
@@ -95,7 +97,7 @@ class OnCluster:
         self._client = client
         self.description = description
 
-    def recording(self, path: Path) -> AbstractContextManager[Any]:
+    def recording(self, path: Place) -> AbstractContextManager[Any]:
         """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
         return _recording(self._client, path)
 
@@ -190,22 +192,22 @@ class OnCluster:
 
 
 @contextmanager
-def _recording(client: Client, path: Path) -> Iterator[None]:
+def _recording(client: Client, path: Place) -> Iterator[None]:
     # one page without external assets, written whole
-    temporary = path.with_name(f".{path.name}.partial")
-    report = performance_report(filename=str(temporary), mode="inline")
-    with client.as_current():
-        report.__enter__()
-    try:
-        yield
-    finally:
-        with client.as_current(), suppress(Exception):
-            # a run that is done is done, though its workers are gone and cannot be asked
-            report.__exit__(None, None, None)
-            # but for its icon the page needs nothing from elsewhere
-            page = re.sub(r'<link rel="shortcut icon"[^>]*>', "", temporary.read_text(encoding="utf-8"))
-            write_bytes(path, page.encode())
-            temporary.unlink()
+    with TemporaryDirectory(prefix="romandask-") as folder:
+        temporary = Path(folder) / "performance.html"
+        report = performance_report(filename=str(temporary), mode="inline")
+        with client.as_current():
+            report.__enter__()
+        try:
+            yield
+        finally:
+            with client.as_current(), suppress(Exception):
+                # a run that is done is done, though its workers are gone and cannot be asked
+                report.__exit__(None, None, None)
+                # but for its icon the page needs nothing from elsewhere
+                page = re.sub(r'<link rel="shortcut icon"[^>]*>', "", temporary.read_text(encoding="utf-8"))
+                write_bytes(path, page.encode())
 
 
 def _given_up(product: ImageProduct | TableProduct, failed: int, waiting: Waiting) -> list[Outcome]:

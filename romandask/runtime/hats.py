@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cdshealpix.nested as healpix
 import numpy as np
@@ -14,8 +13,9 @@ from hats.catalog import CatalogType, TableProperties
 from hats.catalog.dataset.collection_properties import CollectionProperties
 from hats.pixel_math.spatial_index import SPATIAL_INDEX_COLUMN, compute_spatial_index
 
+from romandask.places import Place, remove, write_bytes
 from romandask.runtime.manifest import read_record
-from romandask.runtime.store import MARGIN, Store, write_bytes
+from romandask.runtime.store import MARGIN, Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import LazyUnits, Unit
 
@@ -99,7 +99,8 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
         if record is None or record.rows == 0:
             continue
         path = store.partition(product.stage, product.order or 0, pixel)
-        footer = pq.read_metadata(path)
+        with path.open("rb") as file:
+            footer = pq.read_metadata(file)
         footer.set_file_path(str(path.relative_to(root / "dataset")))
         if metadata is None:
             metadata = footer
@@ -136,7 +137,7 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
     TableProperties.model_validate(properties).to_properties_file(root)
 
 
-def _write_collection(folder: Path, name: str) -> None:
+def _write_collection(folder: Place, name: str) -> None:
     content = dict(
         obs_collection=name, hats_primary_table_url="catalog", all_margins=["margin"], default_margin="margin"
     )
@@ -149,4 +150,4 @@ def _drop_strays(product: TableProduct, store: Store, present: set[int]) -> None
     wanted = {store.partition(product.stage, product.order or 0, pixel) for pixel in present}
     for path in dataset.glob("Norder=*/Dir=*/Npix=*.parquet"):
         if path not in wanted:
-            path.unlink()
+            remove(path)

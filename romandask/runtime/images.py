@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -17,17 +16,18 @@ import pyarrow as pa
 import xarray as xr
 import zarr
 
-from romandask.runtime.manifest import digest, read_record
-from romandask.runtime.store import (
-    Store,
+from romandask.places import Place
+from romandask.runtime.arrays import (
     Variable,
     few_chunks,
     open_images,
-    read_parquet,
+    read_group,
     write_array,
     write_coordinate,
-    write_parquet,
+    write_group,
 )
+from romandask.runtime.manifest import digest, read_record
+from romandask.runtime.store import Store, read_parquet, write_parquet
 from romandask.runtime.tables import conform, to_frame
 from romandask.runtime.units import Made, Unit, names_of
 
@@ -98,7 +98,7 @@ class ImageProduct:
     def reader(self, unit: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
         """Return what reads windows of the last axes of arrays of a stored unit: each is opened once."""
         assert self.store is not None
-        group = zarr.open_group(self.store.images(self.stage), mode="r")
+        group = read_group(self.store.images(self.stage))
         place = self._place(unit)
         opened: dict[str, zarr.Array] = {}
 
@@ -148,7 +148,7 @@ class ImageProduct:
         """Write the arrays of a unit, one after another."""
         variables = {variable.name: variable for variable in self.variables}
         parts, size, rows = {name: digest(content) for name, content in tables.items()}, 0, 0
-        group = zarr.open_group(store.images(self.stage), mode="r+")
+        group = write_group(store.images(self.stage))
         place = self._place(index)
         for name, array in arrays:
             variable = variables.pop(name)
@@ -208,7 +208,7 @@ def _made(array: Any) -> Any:
     return array() if callable(array) else array
 
 
-def table_beside(store: Store, stage: str, name: str, unit: str) -> Path:
+def table_beside(store: Store, stage: str, name: str, unit: str) -> Place:
     """Return the file of a table that belongs to one unit of an image product."""
     return store.table(f"{stage}_{name}", unit)
 

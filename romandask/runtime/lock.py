@@ -7,20 +7,21 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from romandask.model.errors import UserError
+from romandask.places import Place, remove, write_new
+
+_LOCK = ".lock"
 
 
 @contextmanager
-def locked(root: Path) -> Iterator[None]:
+def locked(root: Place) -> Iterator[None]:
     """Hold the store's lock; UserError where another living driver on this host, or any on another, holds it."""
-    path = root / ".lock"
+    path = root / _LOCK
     mine = {"pid": os.getpid(), "host": socket.gethostname()}
     for _ in range(2):
         try:
-            with open(path, "x") as file:
-                json.dump(mine, file)
+            write_new(path, json.dumps(mine).encode())
             break
         except FileExistsError:
             _refuse_or_remove(path, mine)
@@ -29,34 +30,34 @@ def locked(root: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)
+        remove(path)
 
 
-def in_use(root: Path) -> bool:
+def in_use(root: Place) -> bool:
     """True where a driver holds the store: one on this host that lives, or any on another."""
-    held = _holder(root / ".lock")
+    held = _holder(root / _LOCK)
     if held is None:
         return False
     return held.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(held.get("pid") or 0))
 
 
-def _holder(path: Path) -> dict | None:
+def _holder(path: Place) -> dict | None:
     """Return who holds a lock; None where nobody does."""
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, ValueError):
         return {}
 
 
-def _refuse_or_remove(path: Path, mine: dict) -> None:
+def _refuse_or_remove(path: Place, mine: dict) -> None:
     held = _holder(path) or {}
     if held.get("host", mine["host"]) != mine["host"]:
         raise UserError(f"{path.parent}: in use by a driver on {held['host']}; if it is gone, remove {path}")
     if held.get("pid") and held["pid"] != mine["pid"] and _alive(int(held["pid"])):
         raise UserError(f"{path.parent}: in use by another driver (process {held['pid']}); wait for it or stop it")
-    path.unlink(missing_ok=True)
+    remove(path)
 
 
 def _alive(pid: int) -> bool:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from romandask.places import contents
 from romandask.runtime.store import Store, write_json
 
 
@@ -37,10 +39,23 @@ class Record:
 def read_record(store: Store, stage: str, unit: str) -> Record | None:
     """Return the record of a unit; None where there is none, or where it cannot be read or is damaged."""
     try:
-        content = json.loads(store.record(stage, unit).read_text())
+        return _parsed(store.record(stage, unit).read_bytes())
+    except OSError:
+        return None
+
+
+def read_records(store: Store, stage: str) -> Iterator[tuple[str, Record | None]]:
+    """Yield the units of a stage that have a record, in order, and their records; None where one is damaged."""
+    for name, content in contents(store.records(stage), ".json"):
+        yield name, _parsed(content)
+
+
+def _parsed(text: bytes) -> Record | None:
+    try:
+        content = json.loads(text)
         check = content.pop("check")
         return Record(**content) if check == digest(content) else None
-    except (OSError, ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from pathlib import Path
 
+from romandask.places import Place, contents, names_in, remove, write_bytes
 from romandask.runtime.images import ImageProduct
-from romandask.runtime.manifest import Record, digest, read_record
-from romandask.runtime.store import Store, write_bytes
+from romandask.runtime.manifest import Record, digest, read_records
+from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.runtime.work import Task
 
 AGAIN = "failed before"
+FAILED = ".failed"
+"""Ending of the files that say why a unit failed."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +45,18 @@ def pending(
     coming : in a plan, units of earlier stages that will be made; None in a run
     retry : make what failed, too
     """
-    outputs: dict[tuple[str, str], str | None] = dict.fromkeys(coming or (), "to be made")
-    forget = coming is None
+    forget, coming = coming is None, coming or set()
+    stored: dict[str, dict[str, str]] = {}
 
     def output(source: tuple[str, str]) -> str | None:
-        if source not in outputs:
-            record = read_record(store, *source)
-            outputs[source] = record.output if record else None
-        return outputs[source]
+        if source in coming:
+            return "to be made"
+        stage, name = source
+        if stage not in stored:
+            stored[stage] = {unit: record.output for unit, record in read_records(store, stage) if record}
+        return stored[stage].get(name)
 
+    records, failed_with = dict(read_records(store, product.stage)), failures(store, product.stage)
     tasks: dict[str, Task] = {}
     blocked: list[str] = []
     aside: list[str] = []
@@ -60,21 +65,21 @@ def pending(
     for index, unit in enumerate(product.units):
         if any(output(source) is None for source in unit.inputs):
             blocked.append(unit.name)
-            if forget:
-                store.record(product.stage, unit.name).unlink(missing_ok=True)
+            if forget and unit.name in records:
+                remove(store.record(product.stage, unit.name))
             continue
         parts = _parts(unit, output)
-        inputs, record = digest(product.stage, parts), read_record(store, product.stage, unit.name)
+        inputs, record = digest(product.stage, parts), records.get(unit.name)
         if record is not None and record.inputs == inputs:
             kept += 1
             continue
-        failed = failed_inputs(store, product.stage, unit.name) == inputs
+        failed = failed_with.get(unit.name) == inputs
         if failed and not retry:
             aside.append(unit.name)
             continue
-        why = AGAIN if failed else _why(store, product.stage, unit.name, record, parts)
-        if forget:
-            store.record(product.stage, unit.name).unlink(missing_ok=True)
+        why = AGAIN if failed else _why(record, parts) if record or unit.name not in records else "damaged record"
+        if forget and unit.name in records:
+            remove(store.record(product.stage, unit.name))
         tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
         waiting[unit.name] = unit.after
     held = _held(waiting, {*blocked, *aside})
@@ -96,10 +101,10 @@ def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[
     }
 
 
-def _why(store: Store, stage: str, name: str, record: Record | None, parts: dict[str, str]) -> str:
+def _why(record: Record | None, parts: dict[str, str]) -> str:
     """Return why a unit is made."""
     if record is None:
-        return "damaged record" if store.record(stage, name).exists() else "not there"
+        return "not there"
     if not record.parts:
         return "made by an earlier version"
     changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
@@ -119,28 +124,24 @@ def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
 def drop_strays(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
     """Remove the records of units that a stage no longer has, and the failures of those and of what is `made` now."""
     names = set(product.names)
-    for path in store.records(product.stage):
-        if path.stem not in names:
-            path.unlink()
-    for path in failures(store, product.stage):
-        if path.stem not in names or path.stem in made:
-            path.unlink()
+    for name in store.recorded(product.stage):
+        if name not in names:
+            remove(store.record(product.stage, name))
+    for name in names_in(store.records(product.stage), FAILED):
+        if name not in names or name in made:
+            remove(_failure(store, product.stage, name))
 
 
-def failures(store: Store, stage: str) -> list[Path]:
-    """Return the files that say why units of a stage failed."""
-    return sorted(store.record(stage, "x").parent.glob("*.failed"))
+def failures(store: Store, stage: str) -> dict[str, str]:
+    """Return the units of a stage that failed, each with the hash of what it depended on then."""
+    found = contents(store.records(stage), FAILED)
+    return {name: text.split(b"\n", 1)[0].decode(errors="replace").removeprefix("inputs ") for name, text in found}
 
 
 def write_failure(store: Store, stage: str, unit: str, inputs: str, text: str) -> None:
     """Write why a unit failed, and the hash of what it depends on: until that changes it stays set aside."""
-    write_bytes(store.record(stage, unit).with_suffix(".failed"), f"inputs {inputs}\n{text}".encode())
+    write_bytes(_failure(store, stage, unit), f"inputs {inputs}\n{text}".encode())
 
 
-def failed_inputs(store: Store, stage: str, unit: str) -> str | None:
-    """Return the hash of what a unit depended on when it failed; None where it has not failed."""
-    try:
-        first = store.record(stage, unit).with_suffix(".failed").read_text().split("\n", 1)[0]
-    except OSError:
-        return None
-    return first.removeprefix("inputs ")
+def _failure(store: Store, stage: str, unit: str) -> Place:
+    return store.records(stage) / f"{unit}{FAILED}"

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from pathlib import Path
 
+from romandask.places import Place, files_below, remove
 from romandask.runtime.manifest import digest
 from romandask.runtime.store import Store, write_json
 
 
-def seal(store: Store, stage: str, paths: Iterable[Path]) -> None:
+def seal(store: Store, stage: str, paths: Iterable[Place]) -> None:
     """Write the hashes of some files of a stage."""
     # each once, in an order that is always the same
-    files = [path for path in sorted(set(paths)) if path.is_file()]
+    files = [path for path in sorted(set(paths), key=str) if path.is_file()]
     found = {str(path.relative_to(store.root)): digest(path.read_bytes()) for path in files}
     write_json(_place(store, stage), {"files": found, "check": digest(found)})
 
 
 def unseal(store: Store, stage: str) -> None:
     """Take a stage's seal away, before its files are changed."""
-    _place(store, stage).unlink(missing_ok=True)
+    remove(_place(store, stage))
 
 
 def sealed(store: Store, stage: str) -> bool:
@@ -34,7 +34,7 @@ def broken(store: Store, stage: str) -> list[tuple[str, str]]:
     if not path.exists():
         return []
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_bytes())
         files = content["files"]
         if content["check"] != digest(files):
             return [(path.name, "the seal is damaged")]
@@ -50,23 +50,23 @@ def broken(store: Store, stage: str) -> list[tuple[str, str]]:
     return found
 
 
-def _place(store: Store, stage: str) -> Path:
+def _place(store: Store, stage: str) -> Place:
     return store.root / "manifest" / stage / "files.seal"
 
 
-def image_files(store: Store, stage: str, arrays: Iterable[str]) -> list[Path]:
+def image_files(store: Store, stage: str, arrays: Iterable[str]) -> list[Place]:
     """Return the metadata of an image product's arrays, and its coordinates."""
     root = store.images(stage)
     if not root.exists():
         return []
     units = set(arrays)
     found = [root / "zarr.json", *(root / name / "zarr.json" for name in units)]
-    for folder in sorted(path for path in root.iterdir() if path.is_dir() and path.name not in units):
-        found += sorted(path for path in folder.rglob("*") if path.is_file())
+    for folder in (path for path in root.iterdir() if path.is_dir() and path.name not in units):
+        found += files_below(folder)
     return found
 
 
-def catalog_files(store: Store, stage: str) -> list[Path]:
+def catalog_files(store: Store, stage: str) -> list[Place]:
     """Return the files of a HATS catalog that hold no rows."""
     root = store.catalog(stage)
     names = ("hats.properties", "properties", "partition_info.csv", "dataset/_metadata", "dataset/_common_metadata")

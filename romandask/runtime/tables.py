@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
+from romandask.places import Place, remove
 from romandask.runtime.manifest import digest, read_record
 from romandask.runtime.store import Store, read_parquet, write_parquet
 from romandask.runtime.units import Made, Unit, names_of
@@ -125,7 +126,7 @@ class TableProduct:
         table = conform(self.make(index), self.schema, self.stage)
         path = self._path(index, store)
         if table.num_rows == 0 and self.pixels is not None:
-            path.unlink(missing_ok=True)
+            remove(path)
             return Made(digest(b""), 0, 0)
         return Made(digest(write_parquet(path, table)), table.nbytes, table.num_rows)
 
@@ -177,7 +178,7 @@ class TableProduct:
         filled = [part for part in parts if len(part)]
         return pd.concat(filled, ignore_index=True) if filled else self.empty()
 
-    def _path(self, index: int, store: Store):
+    def _path(self, index: int, store: Store) -> Place:
         if self.pixels is None:
             return store.table(self.stage, self.names[index])
         return store.partition(self.stage, self.order or 0, self.pixels[index])

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from conftest import MINI
 
 from romandask.model.seeds import rng
-from romandask.runtime.log import events
+from romandask.runtime.log import events, runs
 from romandask.survey import open_survey
 from romandask.verification import verify
 
@@ -51,7 +51,7 @@ def made(store: Path) -> Counter[str]:
     """How often each unit was made, from the logs of all runs."""
     return Counter(
         f"{event['stage']}/{event['unit']}"
-        for path in (store / "log").glob("*.jsonl") for event in events(path) if event["event"] == "unit"
+        for run in runs(store / "log") for event in events(store / "log", run) if event["event"] == "unit"
     )  # fmt: skip
 
 

@@ -145,7 +145,10 @@ def remove_folder(path: Place) -> None:
 def names_in(folder: Place, ending: str) -> list[str]:
     """Return the names, less an ending, of the files of a folder that have it; none where there is no folder."""
     try:
-        names = [path.name for path in folder.iterdir()]
+        if isinstance(folder, Path):
+            names = os.listdir(folder)
+        else:
+            names = [key.rsplit("/", 1)[-1] for key in folder.fs.ls(folder.path, detail=False)]
     except FileNotFoundError:
         return []
     return sorted(name.removesuffix(ending) for name in names if name.endswith(ending) and not name.startswith("."))

@@ -5,6 +5,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import dask
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -121,3 +122,16 @@ def test_workers_that_die_before_they_begin_are_started_again(monkeypatch):
     with pytest.raises(UserError, match="Nanny failed to start"), runner(1, 1.5):
         pass
     assert starts == [1, 1]
+
+
+def test_local_workers_that_are_gone_for_good_are_started_again(tmp_path):
+    """As when one dies while its nanny starts it: dask leaves it at that."""
+    units = tuple(Unit(f"u{k}", k) for k in range(3))
+    product = TableProduct("table/x", units, Failing(tmp_path, ()), pa.schema([("number", pa.int64())]))
+    tasks = [Task(k, "inputs", 1.0) for k in range(3)]
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}), runner(1, 1.5) as execution:
+        execution._client.retire_workers(close_workers=True)
+        assert not execution._client.scheduler_info()["workers"]
+        outcomes = list(execution.run(product, tasks, Store(tmp_path / "store")))
+    assert all(outcome.record is not None for outcome in outcomes)
+    assert len(outcomes) == 3

@@ -104,7 +104,6 @@ def open_images(
             fill_value=0,
             dimension_names=(*axes, *variable.axes),
             attributes=variable.attributes,
-            config={"write_empty_chunks": True},
             overwrite=True,
         )
     return group
@@ -120,6 +119,8 @@ def few_chunks() -> Any:
 
 def write_array(array: zarr.Array, place: tuple[int, ...], values: np.ndarray) -> None:
     """Write the values of one unit, a file of its last two axes after another: what is written is in memory twice."""
+    # a setting of whoever writes, not of the array: without it chunks of zeros would not be written, and be gone
+    array = array.with_config({"write_empty_chunks": True})
     files = (array.shards or array.chunks)[len(place) :]
     cuts = [range(0, length, step) for length, step in zip(values.shape[-2:], files[-2:], strict=True)]
     for corner in itertools.product(*cuts):

@@ -13,7 +13,7 @@ import time
 import traceback
 import uuid
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -93,8 +93,9 @@ class InProcess:
 class OnCluster:
     """Runs units on a dask cluster, in bounded waves, long units first; results are released at once."""
 
-    def __init__(self, client: Client, description: str):
+    def __init__(self, client: Client, description: str, restart: Callable[[], None] | None = None):
         self._client = client
+        self._restart = restart or (lambda: None)
         self.description = description
 
     def recording(self, path: Place) -> AbstractContextManager[Any]:
@@ -180,6 +181,7 @@ class OnCluster:
             try:
                 return ended.get(timeout=2.0)
             except queue.Empty:
+                self._restart()
                 if self._client.scheduler_info(n_workers=-1)["workers"]:
                     alone_since = None
                     continue
@@ -272,7 +274,9 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         _local_cluster(workers, int(memory_limit * 2**30)) as cluster,
         Client(cluster) as client,
     ):
-        yield OnCluster(client, f"{workers} local workers, dashboard {cluster.dashboard_link}")
+        # a worker that dies while it starts is not started again by dask; to scale to what is wanted starts it
+        description = f"{workers} local workers, dashboard {cluster.dashboard_link}"
+        yield OnCluster(client, description, lambda: cluster.scale(workers))
 
 
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:

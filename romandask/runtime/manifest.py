@@ -30,7 +30,7 @@ class Record:
     """Rows of a table, pixels of an image."""
     seconds: float
     peak_bytes: int
-    """Largest resident memory of the worker that made it, so far in its life."""
+    """Most resident memory of the worker while it made it."""
     warnings: list[str] = field(default_factory=list)
     parts: dict[str, str] = field(default_factory=dict)
     """What `inputs` is the hash of: settings, version, and the outputs of each stage that is read, by its name."""

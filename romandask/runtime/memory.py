@@ -1,8 +1,12 @@
-"""Memory of a process, and how it goes back to the system."""
+"""Memory of a process: how much it has held, and how it goes back to the system."""
 
 from __future__ import annotations
 
 import ctypes
+import re
+import resource
+from contextlib import suppress
+from pathlib import Path
 
 
 def give_back() -> None:
@@ -10,3 +14,19 @@ def give_back() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+def begin_peak() -> int:
+    """Let `peak` begin anew, where the system can (Linux), and return what it is now: what the process holds."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return peak()
+
+
+def peak() -> int:
+    """Return the most resident memory, bytes, that this process has had since `begin_peak`."""
+    try:
+        found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    except OSError:
+        found = None
+    return (int(found.group(1)) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * 1024

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import resource
 import time
 import warnings
 from dataclasses import dataclass, field
 
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.manifest import Record, write_record
-from romandask.runtime.memory import give_back
+from romandask.runtime.memory import begin_peak, give_back, peak
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 
@@ -37,10 +36,14 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
 
     `after` are records of units that it had to wait for: of a task graph's edges the values.
     """
-    start = time.perf_counter()
+    start, held = time.perf_counter(), begin_peak()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         made = product.write(task.index, store)
+    most = peak()
+    told = {f"{item.category.__name__}: {item.message}" for item in caught}
+    if 0 < product.bytes_per_unit < most - held:
+        told.add(f"{product.stage} took more memory than the {product.bytes_per_unit / 2**30:.2f} GiB that it states")
     record = Record(
         stage=product.stage,
         unit=product.names[task.index],
@@ -49,9 +52,9 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
         bytes=made.bytes,
         rows=made.rows,
         seconds=round(time.perf_counter() - start, 3),
-        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        peak_bytes=most,
         parts=task.parts,
-        warnings=sorted({f"{item.category.__name__}: {item.message}" for item in caught}),
+        warnings=sorted(told),
     )
     write_record(store, record)
     if record.seconds > 1:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from romandask.arguments import Overrides, Source, StoreArgument
+from romandask.atlas import export_atlas
 from romandask.calibration import check_files, make_files
 from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth
 from romandask.export_images import export_asdf, export_fits, export_moc, export_obscore
@@ -17,6 +18,7 @@ from romandask.instruments.roman_focal_plane import SCAS
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
 from romandask.pipeline import load_pipeline
+from romandask.runtime.progress import Reporter
 from romandask.survey import Survey, open_survey
 
 export_app = typer.Typer(no_args_is_help=True, help="Write a survey's contents in other formats.")
@@ -73,6 +75,14 @@ def export_asdf_images(
 ) -> None:
     """Write Roman exposures as level 2 images in ASDF, as roman_datamodels and romancal read them."""
     _wrote(export_asdf(open_survey(store), out, exposure))
+
+
+@export_app.command("page")
+def export_page(store: StoreArgument, out: Folder) -> None:
+    """Write the coadds as one page to drag and zoom in, both telescopes at the same place: OUT/index.html."""
+    with Reporter(Console()).busy("drawing"):
+        path = export_atlas(open_survey(store), out)
+    _wrote([path])
 
 
 @export_app.command("obscore")

@@ -15,6 +15,8 @@ from romandask.model.spectra import ab_magnitude
 
 ROMAN_RGB = ("F184", "H158", "J129", "Y106")
 RUBIN_RGB = ("z", "i", "r", "g")
+RGB = (*ROMAN_RGB, *RUBIN_RGB)
+"""Bands from red to blue, of both telescopes."""
 LARGEST = 1600
 """Pixels a side of a picture of a tile; larger tiles are shown by their middle."""
 
@@ -33,7 +35,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     extent = min(extent, LARGEST * min(scale for _, scale in tiles.values()))
     for position, (survey, (bands, scale)) in enumerate(tiles.items()):
         axes = figure.add_subplot(1, len(tiles), position + 1)
-        names = [name for name in (*ROMAN_RGB, *RUBIN_RGB) if name in bands]
+        names = [name for name in RGB if name in bands]
         chosen = [names[0], names[len(names) // 2], names[-1]]
         side = next(iter(bands.values())).shape[0]
         count = int(extent / scale)

@@ -20,7 +20,7 @@ TYPED = [f"romandask/{name}" for name in _TYPED.split()]
 LAYERS = [
     {"cli"},
     {"ingest_commands", "export_commands"},
-    {"export_images"},
+    {"export_images", "atlas"},
     {"arguments", "report", "export", "verification"},
     {"joint_report"},
     {"joint_pictures"},

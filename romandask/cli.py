@@ -25,6 +25,7 @@ from romandask.ingest_commands import ingest_app  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline  # noqa: E402
 from romandask.pixfrac import advice, coverage  # noqa: E402
+from romandask.reference import reference as data_products  # noqa: E402
 from romandask.report import dag_svg, write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
 from romandask.runtime.lock import in_use  # noqa: E402
@@ -209,6 +210,12 @@ def verify(
 def report(store: StoreArgument) -> None:
     """Write the report, one page without external assets, and say where it is."""
     Console().print(f"report: {write_report(open_survey(store))}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def reference() -> None:
+    """Print the data-product reference (Markdown): every table and image, with columns, units and axes."""
+    print(data_products(), end="")
 
 
 def main() -> None:

@@ -49,9 +49,6 @@ def truth_summary(matched: TableProduct, detections: ImageProduct, settings: Det
     )  # fmt: skip
 
 
-REFERENCE_BANDS = ("H158", "i")
-
-
 def reference_band(instrument: Instrument) -> str:
     """Return the band in which magnitudes are compared: H158 of Roman, i of Rubin, or the middle one."""
     bands = instrument.bands

@@ -4,24 +4,31 @@ import ast
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 import yaml
 from conftest import ROOT
+from typer.main import get_command
 
 from romandask.cli import app
+from romandask.reference import reference
 
 PACKAGE = ROOT / "romandask"
-_TYPED = "model runtime formats cli.py ingest_commands.py export_commands.py flow.py verification.py"
+_TYPED = (
+    "model runtime formats places.py atlas.py reference.py cli.py ingest_commands.py export_commands.py flow.py "
+    "verification.py"
+)
 TYPED = [f"romandask/{name}" for name in _TYPED.split()]
 LAYERS = [
     {"cli"},
     {"ingest_commands", "export_commands"},
     {"export_images", "atlas"},
-    {"arguments", "report", "export", "verification"},
+    {"arguments", "reference", "report", "export", "verification"},
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},
@@ -127,16 +134,45 @@ def test_types_hold():
     assert done.returncode == 0, done.stdout
 
 
-def test_every_path_and_command_that_the_readme_names_exists():
-    text = (ROOT / "README.md").read_text()
-    commands = {command.name or command.callback.__name__ for command in app.registered_commands}
-    commands |= {group.name for group in app.registered_groups}
+PAGES = (
+    "README.md",
+    "pipelines/README.md",
+    "pipelines/GUIDE.md",
+    "catalogs/README.md",
+    "romandask/instruments/README.md",
+)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_path_and_command_that_a_page_names_exists(page, tmp_path, monkeypatch):
+    text = (ROOT / page).read_text()
     for path in re.findall(r"`((?:romandask|pipelines|catalogs|tests)/[\w./-]*)`", text):
         assert (ROOT / path).exists(), path
-    for name in re.findall(
-        r"romandask (plan|run|status|report|ingest|\w+) ", " ".join(re.findall(r"^romandask .*$", text, re.M))
-    ):
-        assert name in commands, name
+    monkeypatch.chdir(tmp_path)
+    for block in re.findall(r"```bash\n(.*?)```", text, re.S):
+        for line in block.splitlines():
+            if not line.startswith("romandask "):
+                continue
+            command, words = get_command(app), shlex.split(line, comments=True)[1:]
+            while isinstance(command, click.Group):
+                assert words[0] in command.commands, line
+                command, words = command.commands[words[0]], words[1:]
+            # what is read, options and their values, nothing is done
+            command.make_context("romandask", words)
+
+
+def test_the_python_of_the_guide_runs(tiny_store, tmp_path):
+    (tmp_path / "runs").symlink_to(tiny_store.parent)
+    text = (ROOT / "pipelines" / "GUIDE.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.S))
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "truth/structure" in done.stdout, "the survey's repr"
+
+
+def test_the_reference_of_products_is_what_the_code_makes():
+    """romandask reference > catalogs/REFERENCE.md writes it anew."""
+    assert (ROOT / "catalogs" / "REFERENCE.md").read_text() == reference()
 
 
 def test_ci_runs_the_test_command_of_the_readme():

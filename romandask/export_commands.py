@@ -13,7 +13,8 @@ from romandask.arguments import Overrides, Source, StoreArgument
 from romandask.atlas import export_atlas
 from romandask.calibration import check_files, make_files
 from romandask.export import export_coadd_psf, export_meds, export_obseq, export_psf, export_truth
-from romandask.export_images import export_asdf, export_fits, export_moc, export_obscore
+from romandask.export_images import export_fits, export_moc, export_obscore
+from romandask.export_roman import export_asdf, export_mosaics
 from romandask.instruments.roman_focal_plane import SCAS
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
@@ -71,10 +72,18 @@ def export_fits_images(
 def export_asdf_images(
     store: StoreArgument,
     out: Folder,
-    exposure: Exposures,
+    exposure: Annotated[
+        list[str] | None, typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")
+    ] = None,
+    tile: Annotated[list[str] | None, typer.Option("--tile", help="Name; may be repeated.")] = None,
+    band: Annotated[list[str] | None, typer.Option("--band", help="Of tiles; may be repeated; default: all.")] = None,
 ) -> None:
-    """Write Roman exposures as level 2 images in ASDF, as roman_datamodels and romancal read them."""
-    _wrote(export_asdf(open_survey(store), out, exposure))
+    """Write Roman exposures as level 2 images, tiles as level 3 mosaics, in ASDF, as roman_datamodels reads them."""
+    found = open_survey(store)
+    if not exposure and not tile:
+        raise UserError("export asdf needs --exposure or --tile, one or more")
+    _wrote(export_asdf(found, out, exposure) if exposure else [])
+    _wrote(export_mosaics(found, out, tile, band or []) if tile else [])
 
 
 @export_app.command("page")

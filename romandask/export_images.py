@@ -11,13 +11,12 @@ import pandas as pd
 
 from romandask.export import indices_of, prepare
 from romandask.exposures import empty_variance
-from romandask.formats import fits_image, obscore, roman_asdf
+from romandask.formats import fits_image, obscore
 from romandask.formats.fits_image import Plane
-from romandask.instruments.exposure import exposure_of, pixel_areas
+from romandask.instruments.exposure import exposure_of
 from romandask.kernels.detector import Detector
 from romandask.kernels.layer import errors, rms_of
 from romandask.model.errors import UserError
-from romandask.model.sky import ARCSEC
 from romandask.pointings import corners_of
 from romandask.runtime.images import ImageProduct
 from romandask.survey import Survey
@@ -48,15 +47,10 @@ def export_fits(
     chosen = []
     if exposures:
         product = survey.exposure_product(name)
-        chosen += [(product, index, f"exposure-{name}") for index in _indices(product, exposures, "exposure")]
+        chosen += [(product, index, f"exposure-{name}") for index in units_named(product, exposures, "exposure")]
     if tiles:
         product = survey.coadd_product(name)
-        known = survey.instruments[name].bands
-        wrong = [band for band in bands if band not in known]
-        if wrong:
-            raise UserError(f"band {wrong[0]!r}: {name} has {', '.join(known)}")
-        units = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-        chosen += [(product, index, f"coadd-{name}") for index in _indices(product, units, "tile")]
+        chosen += [(product, index, f"coadd-{name}") for index in tile_units(survey, name, tiles, bands)]
     prepare(folder)
     written = []
     for product, index, kind in chosen:
@@ -67,7 +61,18 @@ def export_fits(
     return written
 
 
-def _indices(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:
+def tile_units(survey: Survey, name: str, tiles: Sequence[str], bands: Sequence[str]) -> list[int]:
+    """Return the numbers of the units of tiles in some bands, all where none are named; UserError as `export_fits`."""
+    known = survey.instruments[name].bands
+    wrong = [band for band in bands if band not in known]
+    if wrong:
+        raise UserError(f"band {wrong[0]!r}: {name} has {', '.join(known)}")
+    units = [f"{tile}-{band}" for tile in tiles for band in bands or known]
+    return units_named(survey.coadd_product(name), units, "tile")
+
+
+def units_named(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:
+    """Return the numbers of units; UserError where the product has no such unit, or it is not stored."""
     indices = indices_of(product, names, kind, product.stage)
     for index in indices:
         if not product.has(index):
@@ -83,7 +88,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
     electrons = arrays["image"].astype(np.float32)
 
     def error() -> np.ndarray:
-        return np.sqrt(arrays["variance"] if "variance" in arrays else _counted(electrons, instrument.detector))
+        return np.sqrt(arrays["variance"] if "variance" in arrays else counted(electrons, instrument.detector))
 
     sky = instrument.background(exposure, header)
     primary = {
@@ -105,7 +110,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
     return header, primary, planes
 
 
-def _counted(image: np.ndarray, detector: Detector) -> np.ndarray:
+def counted(image: np.ndarray, detector: Detector) -> np.ndarray:
     """Return the variance as a pipeline would know it: the electrons that were counted, those of the sky among them."""
     return np.maximum(image, 0).astype(np.float32) + np.float32(detector.read_noise**2)
 
@@ -147,7 +152,7 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
     return maker.header(tile), primary, planes
 
 
-def _flags(product: ImageProduct) -> dict[str, int]:
+def flags_of(product: ImageProduct) -> dict[str, int]:
     """Return the bits of dq by what they mean."""
     attributes = next(variable for variable in product.variables if variable.name == "dq").attributes
     masks, words = attributes.get("flag_masks", []), str(attributes.get("flag_meanings", "")).split()
@@ -156,43 +161,7 @@ def _flags(product: ImageProduct) -> dict[str, int]:
 
 def _cards(product: ImageProduct) -> tuple[tuple[str, str], ...]:
     """Return a card a bit of dq: what it means."""
-    return tuple((f"BIT{int(mask).bit_length() - 1:02d}", word) for word, mask in _flags(product).items())
-
-
-def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[Path]:
-    """Write Roman's exposures as level 2 images (roman_datamodels' ImageModel, electron/s with its sky).
-
-    Raises
-    ------
-    UserError
-        If the survey has no such exposure, it is not stored, or the package roman_datamodels is not there.
-    """
-    roman_asdf.available()
-    product = survey.exposure_product("roman")
-    chosen = _indices(product, exposures, "exposure")
-    flags = _flags(product)
-    prepare(folder)
-    written = []
-    for index in chosen:
-        source = source_of(product)
-        exposure, instrument = exposure_of(source.table.iloc[index]), source.instrument
-        header, arrays = instrument.header(exposure), product.load(index, ("image", "variance", "dq"))
-        rate = np.float32(1 / exposure.exptime)
-        variance = arrays["variance"] if "variance" in arrays else _counted(arrays["image"], instrument.detector)
-        light = np.maximum(arrays["image"], 0).astype(np.float32)
-        planes = {
-            "data": arrays["image"].astype(np.float32) * rate,
-            "err": np.sqrt(variance) * rate,
-            "var_poisson": light * rate**2,
-            "dq": arrays["dq"],
-        }
-        area = float(np.mean(pixel_areas(header, instrument.shape))) * ARCSEC**2
-        # AB: 3631 Jy give ab_photons electrons a second
-        photometry = 3631e-6 / instrument.bandpass(exposure.band).ab_photons() / area, area
-        path = folder / f"exposure-roman-{product.names[index]}.asdf"
-        roman_asdf.write(path, planes, flags, header, vars(exposure), photometry)
-        written.append(path)
-    return written
+    return tuple((f"BIT{int(mask).bit_length() - 1:02d}", word) for word, mask in flags_of(product).items())
 
 
 def export_obscore(survey: Survey, path: Path) -> int:

@@ -2,6 +2,7 @@
 
 import warnings
 
+import asdf
 import dask
 import numpy as np
 import pandas as pd
@@ -14,7 +15,8 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from mocpy import MOC
 
-from romandask.export_images import export_asdf, export_fits, export_moc, export_obscore
+from romandask.export_images import export_fits, export_moc, export_obscore
+from romandask.export_roman import export_asdf, export_mosaics
 from romandask.instruments.exposure import exposure_of
 from romandask.model.errors import UserError
 from romandask.pointings import corners_of
@@ -95,6 +97,46 @@ def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
         light = photons * model.meta.photometry.conversion_megajanskys * model.meta.photometry.pixel_area
         assert light * 1e6 == pytest.approx(3631e-8, rel=1e-6)
     assert not list(tmp_path.glob(".*"))
+
+
+def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
+    """Surface brightness, WCS, exposures by bit, and the metadata of a simulated community product."""
+    tile = survey.tiles[0]
+    (path,) = export_mosaics(survey, tmp_path, [tile.name], ["H158"])
+    coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
+    product = survey.coadd_product("roman")
+    sets = product.load(product.names.index(f"{tile.name}-H158"), ("sets",))["sets"]
+    with rdm.open(path) as model:
+        assert isinstance(model, rdm.datamodels.MosaicModel)
+        model.validate()
+        # MJy/sr over the solid angle of a pixel is its flux
+        pixel = (survey.instruments["roman"].coadd_scale * np.pi / 648000) ** 2
+        np.testing.assert_allclose(np.asarray(model.data) * pixel * 1e15, coadd["image"], rtol=1e-5, atol=1e-3)
+        np.testing.assert_array_equal(model.weight, coadd["weight"])
+        covered = np.asarray(model.weight) > 0
+        assert (np.asarray(model.err)[covered] > 0).all()
+        ra, dec = model.meta.wcs(10.0, 20.0)
+        maker = WCS(tile.header(coadd.sizes["x"], survey.instruments["roman"].coadd_scale))
+        np.testing.assert_allclose(
+            [ra, dec], [float(v) for v in maker.all_pix2world(10.0, 20.0, 0)], rtol=0, atol=1e-10
+        )
+        names = list(model.meta.resample.members)
+        y, x = np.argwhere(covered)[len(np.argwhere(covered)) // 2]
+        bits = {name for k, name in enumerate(names) if int(model.context[k // 32, y, x]) >> (k % 32) & 1}
+        assert bits == set(sets.loc[sets["set"] == int(coadd["set"][y, x]), "exposure"])
+        assert len(bits) == int(coadd["nimages"][y, x])
+        # as many electrons as light of that flux gives in the time of the exposures there
+        bright = np.unravel_index(int(coadd["image"].values.argmax()), covered.shape)
+        flux, number = float(coadd["image"].values[bright]), int(coadd["nimages"].values[bright])
+        seconds = number * float(survey.pointings("roman")["exptime"].iloc[0])
+        electrons = survey.instruments["roman"].bandpass("H158").ab_photons() / 3631e9 * seconds * flux
+        found = float(np.sqrt(model.var_poisson[bright])) / float(model.data[bright])
+        assert found == pytest.approx(1 / np.sqrt(electrons), rel=1e-4)
+        assert model.meta.ccsp["simulated_flag"] is True
+        ccsp = asdf.schema.load_schema("asdf://stsci.edu/datamodels/roman/schemas/CCSP/ccsp_minimal-2.0.0")
+        for name in model.meta.ccsp:
+            assert name in ccsp["properties"]["ccsp"]["properties"], name
+        assert model.meta.coadd_info.time_first < model.meta.coadd_info.time_last
 
 
 def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):

@@ -27,6 +27,7 @@ TYPED = [f"romandask/{name}" for name in _TYPED.split()]
 LAYERS = [
     {"cli"},
     {"ingest_commands", "export_commands"},
+    {"export_roman"},
     {"export_images", "atlas"},
     {"arguments", "reference", "report", "export", "verification"},
     {"joint_report"},

@@ -1,8 +1,9 @@
-"""Roman's level 2 images in ASDF: `ImageModel` of roman_datamodels, which validates what is written."""
+"""Roman's images in ASDF: `ImageModel` and `MosaicModel` of roman_datamodels, which validates what is written."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,14 +83,98 @@ def write(
     meta.wcsinfo.ra_ref, meta.wcsinfo.dec_ref = float(header["CRVAL1"]), float(header["CRVAL2"])
     meta.photometry.conversion_megajanskys, meta.photometry.pixel_area = photometry
     meta.wcs = gwcs_of(header, planes["data"].shape)
-    # whole or not at all, and under its own name, which goes into the file
+    _save(model, path)
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """What is told of a coadd."""
+
+    survey: str
+    """Name of the pipeline."""
+    version: str
+    """Of what made it."""
+    tile: str
+    band: str
+    scale: float
+    """Arcsec a pixel."""
+    native_scale: float
+    """Of the exposures."""
+    pixfrac: float
+    members: tuple[str, ...]
+    """Names of the exposures, in the order of the bits of `context`."""
+    begin: float
+    """MJD of the first."""
+    end: float
+    """MJD at which the last ended."""
+    seconds: float
+    """Exposure time of a pixel, mean over those that have any."""
+
+
+def write_mosaic(path: Path, planes: dict[str, np.ndarray], header: dict[str, Any], about: Mosaic) -> None:
+    """Write a coadd as a level 3 mosaic with the metadata of a community product, said to be simulated.
+
+    Parameters
+    ----------
+    planes : data and err (MJy/sr), var_poisson and var_rnoise (their squares), weight, context (plane, y, x) of bits
+    header : WCS (TAN), FITS cards
+
+    Raises
+    ------
+    UserError
+        If the packages are not there.
+    """
+    available()
+    datamodels = import_module("roman_datamodels.datamodels")
+    model = datamodels.MosaicModel.create_fake_data(shape=planes["data"].shape)
+    for name, plane in planes.items():
+        model[name] = plane
+    meta, shape = model.meta, planes["data"].shape
+    meta.filename, meta.product_type = path.name, "l3"
+    meta.calibration_software_name, meta.calibration_software_version = "romandask", about.version
+    meta.instrument.optical_element = ELEMENTS[about.band]
+    times = {"first": about.begin, "last": about.end, "mean": (about.begin + about.end) / 2}
+    for name, mjd in times.items():
+        meta.coadd_info[f"time_{name}"] = Time(mjd, format="mjd", scale="utc")
+    meta.coadd_info.exposure_time = about.seconds
+    there = planes["weight"] > 0
+    values = planes["data"][there] if there.any() else np.zeros(1, np.float32)
+    meta.statistics.image_median = float(np.median(values))
+    meta.statistics.image_rms = float(values.std(dtype=float))
+    meta.statistics.good_pixel_fraction = float(there.mean())
+    meta.association.name = about.survey
+    meta.cal_step.flux = meta.cal_step.resample = "COMPLETE"
+    meta.cal_step.outlier_detection = meta.cal_step.skymatch = "SKIPPED"
+    meta.resample.pixfrac, meta.resample.pixel_scale_ratio = about.pixfrac, about.scale / about.native_scale
+    meta.resample.pointings, meta.resample.members = len(about.members), list(about.members)
+    meta.resample.weight_type = "exptime"
+    info, centre = meta.wcsinfo, (float(header["CRVAL1"]), float(header["CRVAL2"]))
+    info.ra, info.dec, info.ra_ref, info.dec_ref = *centre, *centre
+    info.x_ref, info.y_ref = float(header["CRPIX1"]) - 1, float(header["CRPIX2"]) - 1
+    info.pixel_scale = info.pixel_scale_ref = about.scale
+    info.orientation = info.orientation_ref = 0.0
+    info.rotation_matrix = [[-1.0, 0.0], [0.0, 1.0]]
+    info.image_shape, info.skycell_name = list(shape), about.tile
+    meta.wcs = gwcs_of(header, shape)
+    corners = meta.wcs(*np.array([(0, 0), (0, shape[0] - 1), (shape[1] - 1, shape[0] - 1), (shape[1] - 1, 0)]).T)
+    info.s_region = "POLYGON ICRS " + " ".join(f"{ra:.9f} {dec:.9f}" for ra, dec in zip(*corners, strict=True))
+    # the schema of minimal metadata of community products; what an archive gives out stays unset
+    meta["ccsp"] = {
+        "name": "romandask", "file_version": about.version[:9], "target_name": "Simulated", "intent": "SCIENCE",
+        "simulated_flag": True, "license": "BSD-3-Clause", "target_keywords": ["Galaxies", "Stars"],
+    }  # fmt: skip
+    _save(model, path)
+
+
+def _save(model: Any, path: Path) -> None:
+    """Write a file whole or not at all, and under its own name, which goes into it."""
     with TemporaryDirectory(dir=path.parent, prefix=".partial-") as folder:
         model.save(Path(folder) / path.name)
         os.replace(Path(folder) / path.name, path)
 
 
 def gwcs_of(header: dict[str, Any], shape: tuple[int, ...]) -> Any:
-    """Return the gwcs of a TAN-SIP header: pixels (from 0) to ICRS, degrees."""
+    """Return the gwcs of a TAN or TAN-SIP header: pixels (from 0) to ICRS, degrees."""
     gwcs = import_module("gwcs")
     frames = import_module("gwcs.coordinate_frames")
     detector = frames.Frame2D(name="detector", axes_order=(0, 1), unit=(units.pix, units.pix))
@@ -100,11 +185,12 @@ def gwcs_of(header: dict[str, Any], shape: tuple[int, ...]) -> Any:
 
 
 def transform_of(header: dict[str, Any]) -> CompoundModel:
-    """Return the transform of a TAN-SIP header from pixels (from 0) to right ascension and declination, degrees."""
+    """Return the transform of a TAN or TAN-SIP header: pixels (from 0) to right ascension, declination, degrees."""
     shift = models.Shift(1 - float(header["CRPIX1"])) & models.Shift(1 - float(header["CRPIX2"]))
     polynomials = []
     for axis, own in (("A", "c1_0"), ("B", "c0_1")):
-        order = int(header[f"{axis}_ORDER"])
+        # without a distortion it is the identity
+        order = int(header.get(f"{axis}_ORDER", 1))
         terms = {
             f"c{i}_{j}": float(header.get(f"{axis}_{i}_{j}", 0.0))
             for i in range(order + 1)

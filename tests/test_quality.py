@@ -97,6 +97,15 @@ def test_kernels_that_make_images_round_alike_wherever_their_arrays_lie():
         assert "fastmath=True" not in path.read_text(), path
 
 
+def test_nothing_that_a_user_writes_can_become_code():
+    for path in modules():
+        found = re.findall(
+            r"pickle|\beval\(|\bexec\(|unsafe_load|shell=True|yaml\.(?:full_)?load\((?!text, _Loader\))",
+            path.read_text(),
+        )
+        assert not found, (path, found)
+
+
 def test_linear_algebra_has_one_thread_wherever_the_package_is():
     """Its sums are rounded otherwise with more, and so are pixels: not by an environment that is set too late alone."""
     code = "import numpy; import romandask, threadpoolctl, json; print(json.dumps(threadpoolctl.threadpool_info()))"

@@ -10,13 +10,12 @@ import numpy as np
 from romandask.model.errors import UserError
 from romandask.runtime.hats import margin
 from romandask.runtime.images import ImageProduct
+from romandask.runtime.memory import INTERPRETER
 from romandask.runtime.store import MARGIN
 from romandask.runtime.tables import TableProduct
 from romandask.survey import Survey
 
 Product = ImageProduct | TableProduct
-INTERPRETER = 420 << 20
-"""Resident memory of a worker before it makes anything, bytes."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import dask
 import numpy as np
 import pandas as pd
+import psutil
 import pyarrow as pa
 import pytest
 from distributed import LocalCluster
@@ -135,3 +136,15 @@ def test_local_workers_that_are_gone_for_good_are_started_again(tmp_path):
         outcomes = list(execution.run(product, tasks, Store(tmp_path / "store")))
     assert all(outcome.record is not None for outcome in outcomes)
     assert len(outcomes) == 3
+
+
+def test_a_local_cluster_listens_on_the_loopback_alone():
+    with runner(2, 1.5):
+        here = psutil.Process()
+        ports = [
+            connection.laddr
+            for process in (here, *here.children(recursive=True))
+            for connection in process.net_connections(kind="inet") if connection.status == psutil.CONN_LISTEN
+        ]  # fmt: skip
+    assert len(ports) >= 4, "scheduler, dashboard, workers"
+    assert {address.ip for address in ports} == {"127.0.0.1"}

@@ -8,6 +8,9 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
+INTERPRETER = 420 << 20
+"""Bytes of a worker before it makes anything: Python and what is imported."""
+
 
 def give_back() -> None:
     """Give free memory to the system, where the C library can: what a unit's first half took is a tenth of a worker."""

@@ -23,7 +23,7 @@ from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.model.sky import from_tangent_plane
 from romandask.model.tiles import tangent_header
-from romandask.pictures import RGB
+from romandask.pictures import colours_of_bands
 from romandask.places import write_bytes
 from romandask.runtime.images import ImageProduct
 from romandask.survey import Survey
@@ -81,9 +81,7 @@ class Layer:
     @cached_property
     def bands(self) -> tuple[str, ...]:
         """The bands that are red, green and blue."""
-        there = self.maker.instrument.bands
-        names = [name for name in RGB if name in there] or list(there)
-        return names[0], names[len(names) // 2], names[-1]
+        return colours_of_bands(self.maker.instrument.bands)
 
     @property
     def finest(self) -> int:

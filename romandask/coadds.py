@@ -92,9 +92,13 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         coordinates,
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
-        bytes_per_unit=pixels**2 * ((3 if drizzled else 45) + 4 * planes)
-        + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 25_000))
-        + (300 << 20 if drawn else 50 << 20),
+        bytes_per_unit=max(
+            pixels**2 * ((3 if drizzled else 45) + 4 * planes)
+            + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 25_000))
+            + (300 << 20 if drawn else 50 << 20),
+            # the PSFs of exposures are sampled before, whatever the size of the tile
+            0 if drawn else 700 << 20,
+        ),
         # a drizzled exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 2.5e-8 * float(mean)),
         tables={"sets": schema("sets")} if drizzled else {},

@@ -66,7 +66,7 @@ def differences(
         lambda: {key: value for key, value in coadds.coordinates().items() if value[0] == ("tile",)},
         {"survey": name, "pixel_scale": blunt.source.instrument.coadd_scale},
         # planes of the tile, those of the basis among them; a strip of the sharper one and its transforms
-        bytes_per_unit=int(pixels**2 * 75 + pixels * ratio * (ROWS + 200) * 30 + (150 << 20)),
+        bytes_per_unit=int(pixels**2 * 75 + pixels * ratio * (ROWS + 200) * 30 + (280 << 20)),
         seconds_per_unit=pixels**2 * ratio * 4e-7,
         tables={"residuals": schema("residuals")},
     )

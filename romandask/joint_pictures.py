@@ -7,7 +7,7 @@ import pandas as pd
 from astropy.visualization import make_lupton_rgb
 from matplotlib.patches import Circle
 
-from romandask.pictures import ROMAN_RGB, RUBIN_RGB, figure_of, in_sigma, png
+from romandask.pictures import colours_of_bands, figure_of, in_sigma, png
 
 CIRCLES = {"roman": (26, 0.7), "rubin": (260, 1.0)}
 """Area (points2) and width of the circles of a survey's objects."""
@@ -26,8 +26,7 @@ def field(images: dict[str, dict[str, np.ndarray]], half: float, marks: dict[str
     figure = figure_of(2.4 * columns, 2.6 * len(images))
     place = {"origin": "lower", "extent": (-half, half, -half, half), "interpolation": "nearest"}
     for row, (survey, bands) in enumerate(images.items()):
-        names = [name for name in (*ROMAN_RGB, *RUBIN_RGB) if name in bands]
-        planes = [in_sigma(bands[name]) for name in (names[0], names[len(names) // 2], names[-1])]
+        planes = [in_sigma(bands[name]) for name in colours_of_bands(tuple(bands))]
         axes = figure.add_subplot(len(images), columns, row * columns + 1)
         axes.imshow(make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0), **place)
         for member, (size, width) in CIRCLES.items():

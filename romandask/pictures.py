@@ -35,8 +35,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     extent = min(extent, LARGEST * min(scale for _, scale in tiles.values()))
     for position, (survey, (bands, scale)) in enumerate(tiles.items()):
         axes = figure.add_subplot(1, len(tiles), position + 1)
-        names = [name for name in RGB if name in bands]
-        chosen = [names[0], names[len(names) // 2], names[-1]]
+        chosen = colours_of_bands(tuple(bands))
         side = next(iter(bands.values())).shape[0]
         count = int(extent / scale)
         first = (side - count) // 2
@@ -54,6 +53,12 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
         axes.set_title(f"{survey}: {', '.join(chosen)}; {scale:g} arcsec pixels")
         axes.set_xlabel("arcsec west")
     return png(figure)
+
+
+def colours_of_bands(bands: tuple[str, ...]) -> tuple[str, str, str]:
+    """Return which of some bands are red, green and blue; where there are few, one is more than one of them."""
+    names = [name for name in RGB if name in bands] or list(bands)
+    return names[0], names[len(names) // 2], names[-1]
 
 
 def effects(images: dict[str, np.ndarray]) -> bytes:

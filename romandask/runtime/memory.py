@@ -8,8 +8,8 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
-INTERPRETER = 420 << 20
-"""Bytes of a worker before it makes anything: Python and what is imported."""
+INTERPRETER = 480 << 20
+"""Bytes of a worker between units: Python, what is imported, and what it keeps of detectors and spectra."""
 
 
 def give_back() -> None:

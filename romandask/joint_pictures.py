@@ -26,14 +26,15 @@ def field(images: dict[str, dict[str, np.ndarray]], half: float, marks: dict[str
     figure = figure_of(2.4 * columns, 2.6 * len(images))
     place = {"origin": "lower", "extent": (-half, half, -half, half), "interpolation": "nearest"}
     for row, (survey, bands) in enumerate(images.items()):
-        planes = [in_sigma(bands[name]) for name in colours_of_bands(tuple(bands))]
+        names = colours_of_bands(tuple(bands))
+        planes = [in_sigma(bands[name]) for name in names]
         axes = figure.add_subplot(len(images), columns, row * columns + 1)
         axes.imshow(make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0), **place)
         for member, (size, width) in CIRCLES.items():
             found = marks[member]
             colours = np.where(found["blend"], "red", "white")
             axes.scatter(found["x"], found["y"], s=size, facecolors="none", edgecolors=colours, linewidths=width)
-        axes.set_title(f"{survey}: {names[0]}, {names[len(names) // 2]}, {names[-1]}", fontsize=9)
+        axes.set_title(f"{survey}: {', '.join(names)}", fontsize=9)
         every = [axes]
         for column, (band, image) in enumerate(bands.items()):
             axes = figure.add_subplot(len(images), columns, row * columns + column + 2)

@@ -69,7 +69,7 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
         {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # three planes, a mask and some chunks of all bands; after that a band's two planes and the map of objects
-        bytes_per_unit=pixels**2 * 13 + (360 << 20),
+        bytes_per_unit=pixels**2 * 13 + (420 << 20),
         seconds_per_unit=pixels**2 * 7e-7,
         tables={"objects": schema("objects", bands)},
     )

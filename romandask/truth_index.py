@@ -32,7 +32,7 @@ def truth_index(exposures: ImageProduct) -> TableProduct:
         LazyUnits(exposures.names, unit),
         MakeIndex(source),
         schema("truth_index"),
-        bytes_per_unit=int(np.prod(source.instrument.shape)) * 16 + (350 << 20),
+        bytes_per_unit=int(np.prod(source.instrument.shape)) * 16 + (520 << 20),
         seconds_per_unit=1.2,
     )
 

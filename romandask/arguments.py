@@ -12,7 +12,7 @@ import typer
 from romandask.places import Place, place_of
 
 
-def source_of(text: str) -> Place:
+def source_place(text: str) -> Place:
     """Return the place of something that is read."""
     return place_of(text, "a source")
 
@@ -35,7 +35,7 @@ StoreArgument = Annotated[
 ]
 Spectra = Annotated[
     Any,
-    typer.Option("--seds", parser=source_of, help="Folder of the spectra that are named; default: seds beside SRC."),
+    typer.Option("--seds", parser=source_place, help="Folder of the spectra that are named; default: seds beside SRC."),
 ]
 Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
 

@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from astropy.visualization import make_lupton_rgb
 from astropy.wcs import WCS
 from PIL import Image
 
@@ -23,11 +22,11 @@ from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.model.sky import from_tangent_plane
 from romandask.model.tiles import tangent_header
-from romandask.pictures import colours_of_bands
+from romandask.pictures import coloured, colours_of_bands, noise_of
 from romandask.places import write_bytes
 from romandask.runtime.images import ImageProduct
 from romandask.survey import Survey
-from romandask.tile_maker import TileMaker, tile_maker
+from romandask.tile_maker import TileMaker, tile_maker, unit_of
 
 SIDE = 512
 """Pixels a side of a picture."""
@@ -95,19 +94,16 @@ class Layer:
         return {key: k for key, k in found.items() if all(self.product.has(self.unit(k, b)) for b in self.bands)}
 
     @cached_property
-    def noise(self) -> tuple[float, ...]:
-        """Scatter of the sky of each band, from the middle of a tile."""
+    def noise(self) -> dict[str, float]:
+        """Scatter of the sky by band, from the middle of a tile."""
         middle = sorted(self.numbers.values())[len(self.numbers) // 2]
         first = max(0, (self.maker.pixels - _SAMPLE) // 2)
         window = (slice(first, first + _SAMPLE),) * 2
-        planes = (self.product.load(self.unit(middle, b), ("image",), window)["image"] for b in self.bands)
-        deviations = (1.4826 * float(np.median(np.abs(plane - np.median(plane)))) for plane in planes)
-        return tuple(deviation or 1.0 for deviation in deviations)
+        return {b: noise_of(self.product.load(self.unit(middle, b), ("image",), window)["image"]) for b in self.bands}
 
     def unit(self, tile: int, band: str) -> int:
         """Return the number of the unit of a tile and band."""
-        bands = self.maker.instrument.bands
-        return tile * len(bands) + bands.index(band)
+        return unit_of(tile, band, self.maker.instrument.bands)
 
     def sampled(self, row: int, column: int) -> np.ndarray:
         """Return a picture (3, side, side) of the finest level in units of the noise; NaN where nothing is."""
@@ -125,10 +121,12 @@ class Layer:
                 continue
             x, y, places = x[inside], y[inside], np.flatnonzero(here)[inside]
             window = slice(y.min(), y.max() + 1), slice(x.min(), x.max() + 1)
-            for plane, band, noise in zip(out, self.bands, self.noise, strict=True):
+            # where there are few bands one is two colours, and read once
+            for band, noise in self.noise.items():
                 found = self.product.load(self.unit(tile, band), ("image", "weight"), window)
                 values = np.where(found["weight"] > 0, found["image"] / noise, np.nan)
-                plane.flat[places] = values[y - window[0].start, x - window[1].start]
+                for plane in (plane for plane, name in zip(out, self.bands, strict=True) if name == band):
+                    plane.flat[places] = values[y - window[0].start, x - window[1].start]
         return out
 
 
@@ -148,9 +146,8 @@ def export_atlas(survey: Survey, folder: Path) -> Path:
     prepare(folder)
     shown = []
     for name, layer in layers.items():
-        _, count = _pictures(layer, folder / name, max(plane.top, layer.finest), 0, 0)
-        one = {"name": name, "finest": layer.finest, "bands": layer.bands, "pictures": count}
-        shown.append(one | {"scale": layer.maker.instrument.coadd_scale})
+        _pictures(layer, folder / name, max(plane.top, layer.finest), 0, 0)
+        shown.append({"name": name, "finest": layer.finest, "bands": list(dict.fromkeys(layer.bands))})
     content = {"name": survey.pipeline.name, "top": plane.top, "surveys": shown} | asdict(plane)
     page = (resource_folder("pages") / "atlas.html").read_text()
     # in a script </ would end it
@@ -174,26 +171,24 @@ def _plane(survey: Survey) -> Plane:
     return Plane(ra % 360, dec, scale, width, height)
 
 
-def _pictures(layer: Layer, folder: Path, level: int, row: int, column: int) -> tuple[np.ndarray | None, int]:
-    """Write a picture and all below it; return its planes (3, side, side), None where nothing is, and how many."""
+def _pictures(layer: Layer, folder: Path, level: int, row: int, column: int) -> np.ndarray | None:
+    """Write a picture and all below it; return its planes (3, side, side), None where nothing is."""
     plane, side = layer.plane, layer.plane.side
     if row * side * 2**level >= plane.height or column * side * 2**level >= plane.width:
-        return None, 0
-    count = 0
+        return None
     if level == layer.finest:
         planes = layer.sampled(row, column)
     else:
         four = np.full((3, 2 * side, 2 * side), np.nan, np.float32)
         for down, right in itertools.product(range(2), repeat=2):
-            part, below = _pictures(layer, folder, level - 1, 2 * row + down, 2 * column + right)
-            count += below
+            part = _pictures(layer, folder, level - 1, 2 * row + down, 2 * column + right)
             if part is not None:
                 four[:, down * side : (down + 1) * side, right * side : (right + 1) * side] = part
         planes = _halved(four)
     if not np.isfinite(planes).any():
-        return None, count
+        return None
     write_bytes(folder / str(level) / f"{row}_{column}.jpg", _jpeg(planes))
-    return planes, count + 1
+    return planes
 
 
 def _halved(planes: np.ndarray) -> np.ndarray:
@@ -208,7 +203,7 @@ def _halved(planes: np.ndarray) -> np.ndarray:
 
 def _jpeg(planes: np.ndarray) -> bytes:
     there = np.isfinite(planes).all(axis=0)
-    picture = make_lupton_rgb(*np.nan_to_num(planes), minimum=-1.0, stretch=12.0, Q=8.0)
+    picture = coloured(np.nan_to_num(planes))
     # what is not there is as the page behind it
     picture[~there] = (16, 18, 24)
     buffer = io.BytesIO()

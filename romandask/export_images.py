@@ -127,11 +127,6 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
     def plane(name: str) -> np.ndarray:
         return product.load(index, (name,))[name]
 
-    def error() -> np.ndarray:
-        weight = plane("weight").copy()
-        noise = product.load(index, ("noise",))["noise"][0]
-        return errors(weight, rms_of(noise, weight))[0]
-
     primary = {
         "TELESCOP": maker.instrument.name.capitalize(),
         "FILTER": (here.band, "band"),
@@ -143,13 +138,19 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
     weight = next(variable for variable in product.variables if variable.name == "weight")
     planes = [
         Plane("SCI", lambda: plane("image"), "nJy"),
-        Plane("ERR", error, "nJy"),
+        Plane("ERR", lambda: tile_error(product, index), "nJy"),
         Plane("DQ", lambda: plane("dq"), cards=_cards(product)),
         Plane("WHT", lambda: plane("weight"), str(weight.attributes["units"])),
         Plane("NIMAGES", lambda: plane("nimages")),
         Plane("PSF", lambda: plane("psf"), on_sky=False, cards=(("PIXSCALE", scale),)),
     ]
     return maker.header(tile), primary, planes
+
+
+def tile_error(product: ImageProduct, index: int) -> np.ndarray:
+    """Return the scatter of the empty pixels of a tile, nJy; 0 where nothing is."""
+    found = product.load(index, ("weight", "noise"))
+    return errors(found["weight"], rms_of(found["noise"][0], found["weight"]))[0]
 
 
 def flags_of(product: ImageProduct) -> dict[str, int]:

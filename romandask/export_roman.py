@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from romandask.export import prepare
-from romandask.export_images import counted, flags_of, tile_units, units_named
+from romandask.export_images import counted, flags_of, tile_error, tile_units, units_named
 from romandask.formats import roman_asdf
 from romandask.instruments.exposure import exposure_of, pixel_areas
-from romandask.kernels.layer import errors, rms_of
 from romandask.model.sky import ARCSEC
 from romandask.runtime.images import ImageProduct
 from romandask.survey import Survey
@@ -81,12 +80,12 @@ def export_mosaics(survey: Survey, folder: Path, tiles: Sequence[str], bands: Se
 def _mosaic(survey: Survey, product: ImageProduct, index: int) -> tuple[dict, dict, roman_asdf.Mosaic]:
     maker = tile_maker(product)
     here, instrument = maker.unit(index), maker.instrument
-    found = product.load(index, ("image", "weight", "noise", "set", "sets"))
+    found = product.load(index, ("image", "weight", "set", "sets"))
     sets, rows = found["sets"], maker.source.table.iloc[here.members]
     # nJy a pixel to MJy/sr
     surface = np.float32(1e-15 / (instrument.coadd_scale**2 * ARCSEC**2))
     weight = found["weight"]
-    error = errors(weight.copy(), rms_of(found["noise"][0], weight))[0] * surface
+    error = tile_error(product, index) * surface
     electrons = instrument.bandpass(here.band).ab_photons() / 3631e9
     names = tuple(sets.drop_duplicates("input").sort_values("input")["exposure"])
     bit = {name: k for k, name in enumerate(names)}

@@ -18,7 +18,7 @@ from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
 from romandask.runtime.log import Log, newest_event
 from romandask.runtime.manifest import read_record, read_records
-from romandask.runtime.pending import Pending, drop_strays, failures, pending, write_failure
+from romandask.runtime.pending import Pending, drop_strays, failed, pending, write_failure
 from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
 from romandask.runtime.store import Store, refuse_full, write_json
@@ -239,14 +239,14 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     assert store is not None
     rows = []
     for stage in stages(survey):
-        failed = len(failures(store, stage.name))
+        aside = len(failed(store, stage.name))
         done = len(store.recorded(stage.name))
         known = stage.name.startswith(("truth/", "pointings/"))
         if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
         else:
             units = -1
-        rows.append((stage.name, units, done, failed))
+        rows.append((stage.name, units, done, aside))
     return rows
 
 

@@ -18,7 +18,7 @@ from romandask.model.config import TruthSettings
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, SpectrumLibrary
-from romandask.places import Place, below
+from romandask.places import Place, below, reached
 from romandask.runtime.hats import with_spatial_index
 from romandask.runtime.schemas import schema
 from romandask.runtime.tables import TableProduct
@@ -36,16 +36,18 @@ def open_sources(settings: TruthSettings, data: Place) -> tuple[Source, ...]:
     UserError
         Naming the file, column or key that is missing or wrong.
     """
-    if settings.source == "skycatalogs":
-        return (skycatalogs.open_source(below(data, str(settings.path))),)
-    if settings.source == "instance_catalog":
-        return (instance_catalog.open_source(below(data, str(settings.path))),)
-    tables = {"galaxy": settings.galaxy_table, "star": settings.star_table}
-    return tuple(
-        table.open_source(below(data, each.path), dict(each.columns), kind)
-        for kind, each in tables.items()
-        if each is not None
-    )
+    opened = {"skycatalogs": skycatalogs.open_source, "instance_catalog": instance_catalog.open_source}
+    if settings.source in opened:
+        place = below(data, str(settings.path))
+        with reached(place):
+            return (opened[settings.source](place),)
+    found = []
+    for kind, each in (("galaxy", settings.galaxy_table), ("star", settings.star_table)):
+        if each is not None:
+            place = below(data, each.path)
+            with reached(place):
+                found.append(table.open_source(place, dict(each.columns), kind))
+    return tuple(found)
 
 
 def incoming(sources: tuple[Source, ...]) -> TableProduct:

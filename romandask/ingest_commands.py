@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from romandask import flow
-from romandask.arguments import Order, Spectra, StoreOption, Workers, resumable, source_of
+from romandask.arguments import Order, Spectra, StoreOption, Workers, resumable, source_place
 from romandask.model.config import read_yaml
 from romandask.model.errors import UserError
 from romandask.pipeline import pipeline_of
@@ -24,7 +24,7 @@ ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a
 @ingest_app.command()
 def skycatalogs(
     source: Annotated[
-        Any, typer.Argument(metavar="SRC", parser=source_of, help="Folder of skyCatalogs files, or its YAML.")
+        Any, typer.Argument(metavar="SRC", parser=source_place, help="Folder of skyCatalogs files, or its YAML.")
     ],
     store: StoreOption,
     seds: Spectra = None,
@@ -37,7 +37,9 @@ def skycatalogs(
 
 @ingest_app.command("instance-catalog")
 def instance_catalog(
-    source: Annotated[Any, typer.Argument(metavar="SRC", parser=source_of, help="A phoSim instance catalog, or .gz.")],
+    source: Annotated[
+        Any, typer.Argument(metavar="SRC", parser=source_place, help="A phoSim instance catalog or .gz.")
+    ],
     store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
@@ -53,7 +55,7 @@ def table(
         Any,
         typer.Argument(
             metavar="MAP",
-            parser=source_of,
+            parser=source_place,
             help="YAML with sections galaxies and stars, each with path and columns (ours: the file's).",
         ),
     ],

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from astropy.visualization import make_lupton_rgb
 from matplotlib.patches import Circle
 
-from romandask.pictures import colours_of_bands, figure_of, in_sigma, png
+from romandask.pictures import coloured, colours_of_bands, figure_of, in_sigma, png
 
 CIRCLES = {"roman": (26, 0.7), "rubin": (260, 1.0)}
 """Area (points2) and width of the circles of a survey's objects."""
@@ -29,7 +28,7 @@ def field(images: dict[str, dict[str, np.ndarray]], half: float, marks: dict[str
         names = colours_of_bands(tuple(bands))
         planes = [in_sigma(bands[name]) for name in names]
         axes = figure.add_subplot(len(images), columns, row * columns + 1)
-        axes.imshow(make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0), **place)
+        axes.imshow(coloured(planes), **place)
         for member, (size, width) in CIRCLES.items():
             found = marks[member]
             colours = np.where(found["blend"], "red", "white")

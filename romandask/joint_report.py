@@ -11,7 +11,7 @@ from romandask import joint_pictures, pictures
 from romandask.matches import length_name
 from romandask.page import image_of, table_of
 from romandask.survey import Survey
-from romandask.tile_maker import tile_maker
+from romandask.tile_maker import tile_maker, unit_of
 
 FIELD = 12.0
 """Half the side of the field that is shown in all bands, arcsec."""
@@ -112,8 +112,8 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         side = makers[key].pixels
         window = tuple(slice(max(place - count, 0), min(place + count + 1, side)) for place in (v, u))
         images[key] = {
-            band: product.load(tile * len(instrument.bands) + k, ("image",), window)["image"]
-            for k, band in enumerate(instrument.bands)
+            band: product.load(unit_of(tile, band, instrument.bands), ("image",), window)["image"]
+            for band in instrument.bands
         }
     marks = {
         key: here[here["survey"] == key].assign(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -41,7 +42,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
         first = (side - count) // 2
         cut = slice(first, first + count)
         planes = [in_sigma(bands[name][cut, cut]) for name in chosen]
-        picture = make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0)
+        picture = coloured(planes)
         half = count * scale / 2
         axes.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
         found = objects.get(survey)
@@ -59,6 +60,11 @@ def colours_of_bands(bands: tuple[str, ...]) -> tuple[str, str, str]:
     """Return which of some bands are red, green and blue; where there are few, one is more than one of them."""
     names = [name for name in RGB if name in bands] or list(bands)
     return names[0], names[len(names) // 2], names[-1]
+
+
+def coloured(planes: Sequence[np.ndarray]) -> np.ndarray:
+    """Return a picture (ny, nx, 3) of three planes, red first, in units of their noise."""
+    return make_lupton_rgb(*planes, minimum=-1.0, stretch=12.0, Q=8.0)
 
 
 def effects(images: dict[str, np.ndarray]) -> bytes:
@@ -344,9 +350,14 @@ def shear(tables: dict[str, pd.DataFrame]) -> bytes:
 
 
 def in_sigma(plane: np.ndarray) -> np.ndarray:
-    """Return an image in units of its own noise (median absolute deviation)."""
+    """Return an image in units of its own noise."""
+    return plane / noise_of(plane)
+
+
+def noise_of(plane: np.ndarray) -> float:
+    """Return the noise of an image by its median absolute deviation; 1 where it has none."""
     sigma = 1.4826 * np.median(np.abs(plane - np.median(plane)))
-    return plane / (sigma if sigma > 0 else 1.0)
+    return sigma if sigma > 0 else 1.0
 
 
 def figure_of(width: float, height: float) -> Figure:

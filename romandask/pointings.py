@@ -64,8 +64,9 @@ def visits(instrument: Instrument, settings, data: Place, region: Region, seed: 
         return instrument.plan(region, seed)
     if not settings.path:
         raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
-    with reached(data):
-        return READERS[settings.source](below(data, settings.path))
+    place = below(data, settings.path)
+    with reached(place):
+        return READERS[settings.source](place)
 
 
 def corners_of(table: pd.DataFrame) -> np.ndarray:

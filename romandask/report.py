@@ -22,6 +22,7 @@ from romandask.pointings import corners_of
 from romandask.readout import before
 from romandask.stages import Planned
 from romandask.survey import Survey
+from romandask.tile_maker import unit_of
 from romandask.truth_match import reference_band
 from romandask.validation import colours_of, depths, residuals, with_truth
 
@@ -129,7 +130,7 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         product = survey.coadd_product(name)
         bands = {}
         for position, band in enumerate(instrument.bands):
-            arrays = product.load(tile * len(instrument.bands) + position, ("image", "weight", "nimages"))
+            arrays = product.load(unit_of(tile, band, instrument.bands), ("image", "weight", "nimages"))
             bands[band] = arrays["image"]
             if position == len(instrument.bands) // 2:
                 layers[name] = (arrays["weight"], arrays["nimages"], band)

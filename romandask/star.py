@@ -17,7 +17,7 @@ from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
 from romandask.psfs import OVERSAMPLING, psf_image
 from romandask.runtime.images import ImageProduct
-from romandask.tile_maker import tile_maker
+from romandask.tile_maker import tile_maker, unit_of
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
 """Photons per nm, in any unit, at wavelengths in nm: a `galsim.SED`, for example."""
@@ -73,7 +73,7 @@ def coadd_psf(
     tiles = [k for k, tile in enumerate(maker.tiles) if tile.id == owner]
     if not tiles:
         raise UserError(f"({ra}, {dec}): outside the tiles of this survey")
-    tile, index = maker.tiles[tiles[0]], tiles[0] * len(instrument.bands) + instrument.bands.index(band)
+    tile, index = maker.tiles[tiles[0]], unit_of(tiles[0], band, instrument.bands)
     header = maker.header(tiles[0])
     target = WCS(header)
     seen = _seen(coadds, index, maker.members[tiles[0], band], instrument, ra, dec, target)

@@ -22,7 +22,7 @@ from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline
-from romandask.places import Place, below, place_of, reached, state_of
+from romandask.places import Place, below, place_of, state_of
 from romandask.pointings import pointings
 from romandask.psfs import psfs
 from romandask.runtime.images import ImageProduct
@@ -83,9 +83,7 @@ class SurveyProducts:
     @cached_property
     def incoming_product(self) -> TableProduct:
         """The rows of the source catalogs, where truth is not generated."""
-        with reached(self.data):
-            sources = open_sources(self.pipeline.truth, self.data)
-        return self._stored(incoming(sources))
+        return self._stored(incoming(open_sources(self.pipeline.truth, self.data)))
 
     @cached_property
     def truth_catalogs(self) -> TruthCatalogs:

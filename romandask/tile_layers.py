@@ -14,6 +14,7 @@ from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.runtime.arrays import chunk_side
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.memory import give_back
+from romandask.tile_maker import unit_of
 
 Window = tuple[slice, ...]
 """Rows and columns of a plane."""
@@ -36,7 +37,7 @@ class TileBands:
 
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
         """Return a window (rows, columns) of arrays of a band; of noise the first realisation."""
-        index = self.tile * len(self.instrument.bands) + self.instrument.bands.index(band)
+        index = unit_of(self.tile, band, self.instrument.bands)
         if index not in self.readers:
             if self.coadds.has(index):
                 self.readers[index] = self.coadds.reader(index)

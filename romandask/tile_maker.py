@@ -68,6 +68,11 @@ class TileMaker:
         return WCS(self.header(tile))
 
 
+def unit_of(tile: int, band: str, bands: tuple[str, ...]) -> int:
+    """Return the number of the unit of a tile and band: of a tile one a band, in their order."""
+    return tile * len(bands) + bands.index(band)
+
+
 def source_of(exposures: ImageProduct) -> RenderExposure:
     """Return what makes exposures.
 

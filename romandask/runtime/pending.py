@@ -73,11 +73,11 @@ def pending(
         if record is not None and record.inputs == inputs:
             kept += 1
             continue
-        failed = failed_with.get(unit.name) == inputs
-        if failed and not retry:
+        again = failed_with.get(unit.name) == inputs
+        if again and not retry:
             aside.append(unit.name)
             continue
-        why = AGAIN if failed else _why(record, parts) if record or unit.name not in records else "damaged record"
+        why = AGAIN if again else _why(unit.name, records, parts)
         if forget and unit.name in records:
             remove(store.record(product.stage, unit.name))
         tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
@@ -101,10 +101,11 @@ def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[
     }
 
 
-def _why(record: Record | None, parts: dict[str, str]) -> str:
+def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) -> str:
     """Return why a unit is made."""
+    record = records.get(name)
     if record is None:
-        return "not there"
+        return "damaged record" if name in records else "not there"
     if not record.parts:
         return "made by an earlier version"
     changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
@@ -127,9 +128,14 @@ def drop_strays(product: ImageProduct | TableProduct, store: Store, made: Set[st
     for name in store.recorded(product.stage):
         if name not in names:
             remove(store.record(product.stage, name))
-    for name in names_in(store.records(product.stage), FAILED):
+    for name in failed(store, product.stage):
         if name not in names or name in made:
             remove(_failure(store, product.stage, name))
+
+
+def failed(store: Store, stage: str) -> list[str]:
+    """Return the units of a stage that failed."""
+    return names_in(store.records(stage), FAILED)
 
 
 def failures(store: Store, stage: str) -> dict[str, str]:

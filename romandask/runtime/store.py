@@ -90,17 +90,11 @@ class Store:
 
     def prepare(self) -> None:
         """Make the folder, and raise a UserError where it cannot be written."""
-        if not isinstance(self.root, Path):
+        probe = self.root / f".probe-{uuid.uuid4().hex}"
+        try:
             with reached(self.root):
-                probe = self.root / f".probe-{uuid.uuid4().hex}"
                 write_bytes(probe, b"")
                 remove(probe)
-            return
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            probe = self.root / f".probe-{uuid.uuid4().hex}"
-            probe.write_bytes(b"")
-            probe.unlink()
         except OSError as error:
             raise UserError(
                 f"{self.root}: the store cannot be written ({error.strerror}): choose another --store"

@@ -259,7 +259,7 @@ def exposures(
         {"survey": instrument.name},
         # image, truth, dq, background and working copies; the wide PSF of one node, as GalSim samples it or as it is
         # drawn; the objects, and the PSFs of a detector and band, the last and the new
-        bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (500 << 20),
+        bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
         # sky, noise and storage, every effect and its calibration; then objects
         seconds_per_unit=ny * nx * ((2.5e-7 if readout is None else 7e-7) + instrument.pixel_scale**2 / 3600 * 0.15),
         tables={"trapped": schema("trapped")} if isinstance(readout, ScaReadout) else {},

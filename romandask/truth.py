@@ -217,7 +217,9 @@ def _tables(
     settings: TruthSettings, cells: np.ndarray, bands: tuple[str, ...], density: float
 ) -> Callable[..., TableProduct]:
     """Return a function that makes the product of one kind of object over the cells."""
-    per_cell = int(cell_area(settings.order) * density * BYTES_A_ROW) + (220 << 20)
+    rows = int(cell_area(settings.order) * density * BYTES_A_ROW)
+    # of few rows the spectra and dust are most
+    per_cell = max(rows + (150 << 20), 220 << 20)
 
     def table(kind: str, make: Callable[[int], pd.DataFrame], state: Any, inputs: tuple) -> TableProduct:
         units = tuple(Unit(f"{settings.order}-{cell}", {**state, "cell": int(cell)}, inputs) for cell in cells)

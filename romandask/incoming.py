@@ -160,7 +160,7 @@ class Assemble:
             names = frame[column]
             if column != "sed":
                 names = names.where(np.isfinite(frame[column.replace("_sed", "_magnorm")]), "")
-            bad = names.map(self.unusable).fillna("").to_numpy(object)
+            bad = names.map(lambda name: self.unusable.get(name, "")).to_numpy(object)
             index = names.map(place).fillna(-1).to_numpy(int)
             known = index >= 0
             short = np.zeros(len(frame), bool)

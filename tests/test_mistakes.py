@@ -116,6 +116,8 @@ COMMANDS = {
     "sequence without a path": ([*RUN, "roman.pointings={source: obseq}"], ["roman.pointings.path"]),
     "sequence cut": ([*RUN, "roman.pointings={source: obseq, path: cut.fits}"], ["cut.fits", "not a complete FITS"]),
     "tiles that do not fit": ([*RUN, "coadds.pixels=12000"], ["GiB", "coadds.pixels", "run.memory_limit"]),
+    "whole sky in small cells": (["plan", "p.yaml", "region={ra: [0, 360], dec: [-90, 90]}"], ["cells", "truth.order"]),
+    "tiles without number": (["plan", "p.yaml", "coadds.scale=1e-7"], ["tiles", "coadds.pixels"]),
     "pixfrac beyond one": (["plan", "p.yaml", "coadds.pixfrac=3"], ["coadds.pixfrac", "3"]),
     "limit in small letters": (["plan", "p.yaml", "matches.limits={h158: 25}"], ["h158", "H158, i"]),
     "folder as pipeline": (["plan", "folder"], ["folder", "no such pipeline"]),

@@ -18,6 +18,15 @@ MAX_ROWS = 200_000
 """Rows of a batch at most."""
 DARK = 50.0
 """Magnorm from which instance catalogs mean an object without light (imSim skips it, instcat.py)."""
+FIRST_GALAXY = 50.0
+"""Redshift beyond which there is none; a larger one is a mistake of its catalog, as are the limits that follow."""
+BRIGHTEST = -10.0
+"""Magnitude; of Venus -5."""
+LARGEST = 600.0
+"""Half-light radius, arcsec; that of the Large Magellanic Cloud is larger, its light is no survey's object."""
+MOST_KNOTS = 10_000
+MOST_DUST = 100.0
+"""A_v, mag; of the Galaxy's centre 30."""
 
 FLOATS = tuple(
     (
@@ -187,15 +196,24 @@ def quarantine_reasons(frame: pd.DataFrame, bins: int = 0) -> dict[str, np.ndarr
         lengths = {c: np.fromiter(map(len, frame[f"sed_val_{c}"]), int, len(frame)) for c in COMPONENTS}
         known = {c: (frame[f"{c}_sed"].to_numpy(object) != "") | (lengths[c] > 0) for c in COMPONENTS}
         bright = np.isfinite(value["magnorm"]) | (np.isfinite(value["ref_mag"]) & (value["ref_band"] != ""))
+        dust = [value["MW_av"]] + [np.where(own_dust[c], value[f"{c}_av"], 0) for c in own_dust]
+        magnitudes = [np.where(galaxy, value[f"{c}_magnorm"], 0) for c in COMPONENTS]
+        magnitudes += [np.where(star, value[name], 0) for name in ("magnorm", "ref_mag")]
         return {
             "id is missing, negative or not an integer": value["id"] < 0,
             "position is not a number": ~place,
+            "right ascension is beyond -360 to 360 degrees": np.abs(value["ra"]) > 360,
             "redshift is not a number": galaxy & (~np.isfinite(value["redshift"]) | (value["redshift"] < 0)),
-            "shear or convergence beyond the weak regime": galaxy & (~(lens > 0) | ~(value["convergence"] < 1)),
+            f"redshift above {FIRST_GALAXY:g}": galaxy & (value["redshift"] > FIRST_GALAXY),
+            "shear or convergence beyond the weak regime": galaxy & (~(lens > 0) | ~(np.abs(value["convergence"]) < 1)),
             "size is negative or not a number": _any(shaped[c] & ~sized[c] for c in shaped),
+            f"size above {LARGEST:g} arcsec": _any(shaped[c] & (axes[c][0] > LARGEST) for c in shaped),
             "minor axis above the major axis": _any(shaped[c] & ~ordered[c] for c in shaped),
             "position angle is not a number": galaxy & ~np.isfinite(value["position_angle_unlensed"]),
+            "position angle is beyond -360 to 360 degrees": galaxy & (np.abs(value["position_angle_unlensed"]) > 360),
             "knots have light but no number": lit["knots"] & (value["n_knots"] < 1),
+            f"more than {MOST_KNOTS} knots": lit["knots"] & (value["n_knots"] > MOST_KNOTS),
+            f"A_v above {MOST_DUST:g} mag": _any(each > MOST_DUST for each in dust),
             "A_v is negative or not a number": _any(
                 [~np.isfinite(value["MW_av"]) | (value["MW_av"] < 0)]
                 + [own_dust[c] & ~(np.isfinite(value[f"{c}_av"]) & (value[f"{c}_av"] >= 0)) for c in own_dust]
@@ -211,6 +229,7 @@ def quarantine_reasons(frame: pd.DataFrame, bins: int = 0) -> dict[str, np.ndarr
             "no spectrum is named": _any(lit[c] & ~known[c] for c in COMPONENTS) | (star & (value["sed"] == "")),
             "no component has light": galaxy & ~_any(lit[c] for c in COMPONENTS),
             "magnorm is not a number": star & ~bright,
+            f"brighter than magnitude {BRIGHTEST:g}": _any(each < BRIGHTEST for each in magnitudes),
         }
 
 

@@ -71,7 +71,7 @@ class TruthSettings(Section):
     star_table: TableSettings | None = Field(None, description="stars, with source: table")
     seds: str | None = Field(None, description="folder of spectra that the catalog names, below `data`")
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
-    margin: float = Field(20.0, ge=0, description="objects this far outside the region are kept, arcsec")
+    margin: float = Field(20.0, ge=0, le=3600, description="objects this far outside the region are kept, arcsec")
     galaxies: float = Field(597.2, ge=0, description="galaxies to r < 29, per square arcminute")
     stars: float = Field(3.96, ge=0, description="stars to r < 29, per square arcminute")
     star_seds: str | None = Field(

@@ -11,8 +11,12 @@ import numpy as np
 from astropy.coordinates import Latitude, Longitude
 from scipy.spatial import cKDTree
 
+from romandask.model.errors import UserError
+
 ARCSEC = np.pi / 180 / 3600
 """One arcsecond in radians."""
+MOST_CELLS = 1_000_000
+"""HEALPix cells of a region, and so partitions of a catalog: each is planned by itself."""
 _PAIRS = 200_000
 """Pairs of polygons that are compared at a time: some tens of megabytes."""
 _FOOTPRINTS = 20_000
@@ -175,7 +179,19 @@ class Region:
         return (offset < min(self.width + 2 * grow, 360.0)) & (np.asarray(dec) >= low) & (np.asarray(dec) < high)
 
     def cells(self, order: int, margin: float = 0.0) -> np.ndarray:
-        """Return the HEALPix cells (nested, `order`) that may touch the box grown by `margin` arcsec, sorted."""
+        """Return the HEALPix cells (nested, `order`) that may touch the box grown by `margin` arcsec, sorted.
+
+        Raises
+        ------
+        UserError
+            Where they would be more than MOST_CELLS.
+        """
+        if self.area > MOST_CELLS * cell_area(order):
+            raise UserError(
+                f"region has {self.area / cell_area(order):.3g} HEALPix cells of order {order}, "
+                f"at most {MOST_CELLS} can be planned: lower truth.order, detections.order and matches.order, or make "
+                "the region smaller"
+            )
         ra, dec = self.centre
         # the furthest point from the centre lies on the edge; points along it are at most 1/64 of it apart
         along = np.linspace(0, 1, 65)

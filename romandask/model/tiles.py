@@ -13,6 +13,8 @@ import numpy as np
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, from_tangent_plane
 
+MOST_TILES = 3_000_000
+"""Tiles of a region: of the paper's size as many as cover the whole sky."""
 _RING = 1 << 32
 
 
@@ -99,8 +101,15 @@ class TileGrid:
         Raises
         ------
         UserError
-            Where the padding does not reach the edges of the unique area (too close to a pole).
+            Where the padding does not reach the edges of the unique area (too close to a pole), or tiles would be
+            more than MOST_TILES.
         """
+        count = region.area * 3600 / self.inner**2
+        if count > MOST_TILES:
+            raise UserError(
+                f"region has {count:.3g} tiles {self.inner:.3g} arcsec wide, at most {MOST_TILES} can be planned: "
+                "raise coadds.pixels or coadds.scale, or make the region smaller"
+            )
         step = self.inner / 3600
         first = int(np.floor((region.dec_min + 90) / step + 1e-9))
         last = min(int(np.ceil((region.dec_max + 90) / step - 1e-9)), self._rings)

@@ -36,6 +36,7 @@ class Nothing:
     stage: str
     names: tuple[str, ...]
     seconds_per_unit: float
+    bytes_per_unit: int
 
     def write(self, index: int, store: Store) -> Made:
         return Made(self.names[index], 0, 0)
@@ -60,7 +61,7 @@ def main(overrides: list[str]) -> None:
             start = time.perf_counter()
             made = product
             if not stage.name.startswith("pointings/"):
-                made = Nothing(product, product.stage, product.names, product.seconds_per_unit)
+                made = Nothing(product, product.stage, product.names, product.seconds_per_unit, product.bytes_per_unit)
             outcomes = list(execution.run(made, todo.tasks, store))
             ran = time.perf_counter() - start
             failed = [outcome.failure for outcome in outcomes if outcome.record is None]

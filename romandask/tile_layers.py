@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from romandask.instruments.exposure import Instrument
-from romandask.kernels.extract import psf_scatter
+from romandask.kernels import psf_fit
 from romandask.kernels.layer import Layer, errors, median, noise_ratios, rms_of, weighted_mean
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.runtime.arrays import chunk_side
@@ -55,7 +55,7 @@ class TileBands:
         error, mask = errors(weight, rms)
         ratios = noise_ratios(noise, error, mask)
         psf = self.arrays(band, ("psf",))["psf"]
-        spread = psf_scatter(noise, psf, error)
+        spread = psf_fit.scatter(noise, psf, error)
         # before the image is read: the noise has told what it can
         del noise, weight
         give_back()
@@ -91,7 +91,7 @@ class TileBands:
                 noise[part], _ = weighted_mean([one["noise"] for one in parts], weights, spreads)
         error, mask = errors(total, rms_of(noise, total))
         psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
-        return Layer(image, error, mask, noise_ratios(noise, error, mask), psf, psf_scatter(noise, psf, error))
+        return Layer(image, error, mask, noise_ratios(noise, error, mask), psf, psf_fit.scatter(noise, psf, error))
 
 
 def _blocks(shape: tuple[int, int]) -> Iterator[Window]:

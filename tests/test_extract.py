@@ -12,6 +12,7 @@ from astropy.io import fits
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from romandask.kernels import psf_fit
 from romandask.kernels.extract import (
     FLAGS,
     NOT_DEBLENDED,
@@ -20,7 +21,6 @@ from romandask.kernels.extract import (
     ellipse_flux,
     kron_fluxes,
     psf_fluxes,
-    psf_scatter,
 )
 from romandask.kernels.layer import Layer, errors, median, noise_ratios, rms_of, weighted_mean
 
@@ -108,7 +108,7 @@ def test_quoted_errors_are_the_scatter_on_correlated_noise():
     weight[:, : SIDE // 2] = 2.0
     noise, other = (np.asarray(plane / np.sqrt(weight), np.float32) for plane in (noise, other))
     layer = layer_of(other, noise, weight)
-    layer = replace(layer, psf_ratio=psf_scatter(noise, layer.psf, layer.error))
+    layer = replace(layer, psf_ratio=psf_fit.scatter(noise, layer.psf, layer.error))
     x, y = random.uniform(40, SIDE - 40, (2, 3000))
     for radius in (2.0, 5.0, 11.0):
         ones, nowhere = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)
@@ -159,3 +159,29 @@ def test_the_mean_weighs_bands_by_their_variance():
     np.testing.assert_allclose(mean[0], 1)
     np.testing.assert_allclose(mean[1:], (0.5 * 1 + 5 * 3) / 5.5)
     np.testing.assert_allclose(total[1:], 5.5)
+
+
+@pytest.mark.parametrize("side", [71, 25, 9])
+def test_psf_fits_are_those_of_scipys_spline(side):
+    random = np.random.default_rng(5)
+    offset = np.arange(side) - (side - 1) / 2
+    psf = np.exp(-(offset[:, None] ** 2 + offset**2) / 6) + 0.01 * random.random((side, side))
+    image = random.normal(size=(90, 120)).astype(np.float32)
+    x, y = random.uniform(-3, 123, 300), random.uniform(-3, 93, 300)
+    x[:20], y[:2] = np.rint(x[:20]), np.rint(y[:2])
+    flux, norm = psf_fit.fit(image, psf, x, y)
+    inside = 0
+    for n in range(300):
+        ix, iy = round(x[n]), round(y[n])
+        if not (12 <= ix < 108 and 12 <= iy < 78):
+            assert np.isnan(flux[n])
+            assert norm[n] == 0
+            continue
+        inside += 1
+        v, u = np.mgrid[-12:13, -12:13]
+        place = [v + (side - 1) / 2 + iy - y[n], u + (side - 1) / 2 + ix - x[n]]
+        model = ndimage.map_coordinates(psf, place, order=5)
+        assert norm[n] == pytest.approx((model**2).sum(), rel=1e-10)
+        data = image[iy - 12 : iy + 13, ix - 12 : ix + 13]
+        assert flux[n] == pytest.approx((model * data).sum() / (model**2).sum(), rel=1e-9, abs=1e-12)
+    assert inside > 100

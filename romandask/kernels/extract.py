@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import sep
-from scipy import ndimage
 
+from romandask.kernels import psf_fit
 from romandask.kernels.apertures import blendedness, kron_radii, sums
-from romandask.kernels.layer import TRIALS, Layer, at
+from romandask.kernels.layer import Layer, at
 from romandask.kernels.peaks import find_peaks
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
@@ -32,8 +32,6 @@ FLAGS = {
     "saturated": SATURATED_CORE,
 }
 """Bits of the flags column: sep's own, then ours."""
-PSF_RADIUS = 12
-"""Half the side of the window of PSF photometry, pixels."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,8 @@ def detect(
         found, segments = sep.extract(image, threshold, deblend_nthresh=levels, deblend_cont=1.0, **options)
         extra = NOT_DEBLENDED
     error[mask] = 0.0
-    objects = _measured(layer, found, segments)
-    kept = select(objects, objects.snr >= min_snr)
-    return replace(kept, flags=kept.flags | extra), segments
+    objects = _measured(layer, found, segments, min_snr=min_snr)
+    return replace(objects, flags=objects.flags | extra), segments
 
 
 def detect_peaks(layer: Layer, threshold: float, min_area: int, min_snr: float) -> tuple[Found, np.ndarray]:
@@ -119,10 +116,15 @@ def _make_room() -> None:
     sep.set_sub_object_limit(16_384)
 
 
-def _measured(layer: Layer, found: np.ndarray, segments: np.ndarray, reach: float = REACH) -> Found:
+def _measured(
+    layer: Layer, found: np.ndarray, segments: np.ndarray, reach: float = REACH, min_snr: float | None = None
+) -> Found:
     """Return what is measured of the objects that sep has found, in the order of their numbers in the map.
 
-    The radius of light is measured within `reach` semi-axes.
+    Parameters
+    ----------
+    reach : semi-axes within which the radius of light is measured
+    min_snr : least signal to noise of the Kron flux of those that are returned; None for all
     """
     image, mask = layer.image, layer.mask
     x, y, a, b, theta = (found[name].astype(float) for name in ("x", "y", "a", "b", "theta"))
@@ -134,17 +136,24 @@ def _measured(layer: Layer, found: np.ndarray, segments: np.ndarray, reach: floa
     dark = np.where(np.isfinite(radius), 0, sep.APER_NONPOSITIVE)
     radius = np.maximum(KRON_FACTOR * np.nan_to_num(radius), KRON_MIN)
     flux, flux_error, flag = ellipse_flux(layer, segments, label, x, y, a, b, theta, radius)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        snr = np.where(flux_error > 0, flux / flux_error, 0.0)
+    flag = found["flag"] | dark | flag
+    if min_snr is not None:
+        keep = snr >= min_snr
+        # most are noise, and what follows takes most of the time
+        x, y, a, b, theta, label, radius, flux, snr, flag, found = (
+            values[keep] for values in (x, y, a, b, theta, label, radius, flux, snr, flag, found)
+        )
     half, half_flag = sep.flux_radius(
         image, x, y, 6.0 * a + 5, 0.5, normflux=np.where(flux > 0, flux, 1.0), mask=mask, subpix=5
     )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        snr = np.where(flux_error > 0, flux / flux_error, 0.0)
     half = np.where(np.isfinite(half) & (half > 0), half, 1.0)
     blended = blendedness(image, mask, segments, label, x, y, found["x2"], found["y2"], found["xy"])
     xw, yw = _windowed(image, mask, x, y, half)
     return Found(
         label, xw, yw, x, y, a, b, theta, found["x2"], found["y2"], found["xy"], radius, half, snr, blended,
-        (found["flag"] | dark | flag | half_flag).astype(np.int32),
+        (flag | half_flag).astype(np.int32),
     )  # fmt: skip
 
 
@@ -194,24 +203,10 @@ def aperture_fluxes(layer: Layer, segments: np.ndarray, found: Found, radius: fl
 
 def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and error of every object as a point source: unweighted fit of the PSF in a window."""
-    flux, norm = _psf_fit(layer.image, layer.psf, found.x, found.y)
+    flux, norm = psf_fit.fit(layer.image, layer.psf, found.x, found.y)
     with np.errstate(divide="ignore", invalid="ignore"):
         white = np.where(norm > 0, at(layer.error, found.x, found.y) / np.sqrt(norm), np.nan)
     return flux, np.sqrt((white * layer.psf_ratio) ** 2 + layer.poisson(flux, found.x, found.y))
-
-
-def psf_scatter(noise: np.ndarray, psf: np.ndarray, error: np.ndarray) -> float:
-    """Return how much larger the scatter of PSF fits to a noise realisation is than that of white noise.
-
-    `error` (ny, nx) is the rms of a pixel, 0 for no data.
-    """
-    random = np.random.default_rng(0)
-    ny, nx = noise.shape
-    x, y = (random.uniform(PSF_RADIUS, n - 1 - PSF_RADIUS, TRIALS) for n in (nx, ny))
-    trial, norm = _psf_fit(noise, psf, x, y)
-    pixel = at(error, x, y)
-    good = (pixel > 0) & (norm > 0)
-    return float(np.std(trial[good] * np.sqrt(norm[good]) / pixel[good])) if good.sum() > 50 else 1.0
 
 
 def psf_half_light_radius(psf: np.ndarray) -> float:
@@ -235,28 +230,3 @@ def _windowed(
     xw, yw, _ = sep.winpos(image, x, y, 2.0 / 2.35 * half, mask=mask)
     good = np.hypot(xw - x, yw - y) < np.minimum(half, 1.0)
     return np.where(good, xw, x), np.where(good, yw, y)
-
-
-def _psf_fit(image: np.ndarray, psf: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return sum(P d) / sum(P^2) and sum(P^2) with the PSF shifted to each position; NaN and 0 near the edge."""
-    flux, norm = np.full(len(x), np.nan), np.zeros(len(x))
-    offset = np.arange(-PSF_RADIUS, PSF_RADIUS + 1)
-    middle = (psf.shape[0] - 1) / 2
-    smooth = ndimage.spline_filter(psf.astype(float), order=5)
-    ix, iy = np.rint(x).astype(int), np.rint(y).astype(int)
-    inside = (
-        (ix >= PSF_RADIUS)
-        & (iy >= PSF_RADIUS)
-        & (ix < image.shape[1] - PSF_RADIUS)
-        & (iy < image.shape[0] - PSF_RADIUS)
-    )
-    rows = np.flatnonzero(inside)
-    for first in range(0, len(rows), 512):
-        part = rows[first : first + 512]
-        u = middle + (ix - x)[part, None, None] + offset[None, None, :]
-        v = middle + (iy - y)[part, None, None] + offset[None, :, None]
-        model = ndimage.map_coordinates(smooth, np.broadcast_arrays(v, u), order=5, prefilter=False)
-        data = image[(iy[part, None] + offset)[:, :, None], (ix[part, None] + offset)[:, None, :]]
-        norm[part] = (model**2).sum(axis=(1, 2))
-        flux[part] = (model * data).sum(axis=(1, 2)) / np.where(norm[part] > 0, norm[part], np.nan)
-    return flux, norm

@@ -8,6 +8,7 @@ from romandask.coadds import coadds
 from romandask.cutouts import cutouts
 from romandask.detections import detections, objects
 from romandask.exposures import exposures
+from romandask.flow import run_on
 from romandask.matches import matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
@@ -40,6 +41,7 @@ __all__ = [
     "open",
     "pointings",
     "psfs",
+    "run_on",
     "statistics",
     "truth",
     "truth_index",

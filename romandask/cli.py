@@ -18,7 +18,7 @@ from rich.console import Console  # noqa: E402
 from rich.live import Live  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
-from romandask import flow, stages, verification  # noqa: E402
+from romandask import checksums, flow, stages, verification  # noqa: E402
 from romandask.arguments import Overrides, Scheduler, Source, StoreArgument, StoreOption, Workers, resumable  # noqa: E402
 from romandask.export_commands import calibration_app, export_app  # noqa: E402
 from romandask.ingest_commands import ingest_app  # noqa: E402
@@ -190,7 +190,12 @@ def verify(
         bool, typer.Option("--forget", help="Remove the records of what is damaged: the next run makes it anew.")
     ] = False,
 ) -> None:
-    """Read every stored byte and compare it with what the manifest says was written."""
+    """Read every stored byte and compare it with what the manifest says was written; exported files too."""
+    if isinstance(store, Path) and (store / checksums.NAME).is_file():
+        if only or forget:
+            raise UserError(f"{store}: exported files have no stages and no records: verify them without options")
+        _verify_files(store)
+        return
     survey, units, damaged = open_survey(store), 0, 0
     for found in verification.verify(survey, only):
         units, damaged = units + found.units, damaged + len(found.damaged)
@@ -204,6 +209,17 @@ def verify(
         )
         raise typer.Exit(1)
     print(f"{store}: {units} units are as they were written")
+
+
+def _verify_files(folder: Path) -> None:
+    found = list(checksums.check(folder))
+    damaged = [(name, why) for name, why in found if why]
+    for name, why in damaged:
+        print(f"damaged: {folder / name}: {why}")
+    if damaged:
+        print(f"{len(damaged)} damaged: export them again")
+        raise typer.Exit(1)
+    print(f"{folder}: {len(found)} files are as they were written")
 
 
 @app.command()

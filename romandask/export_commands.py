@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from romandask import checksums
 from romandask.arguments import Overrides, Source, StoreArgument
 from romandask.atlas import export_atlas
 from romandask.calibration import check_files, make_files
@@ -28,7 +29,9 @@ Folder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files
 Exposures = Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")]
 
 
-def _wrote(paths: Iterable[Path]) -> None:
+def _wrote(paths: Sequence[Path]) -> None:
+    """Say what was written, and write its checksums beside it."""
+    checksums.note(paths)
     for path in paths:
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
@@ -47,6 +50,7 @@ def export_visits(
 ) -> None:
     """Write all Roman visits of a pipeline as an observing sequence (FITS) that GalSim-based tools read."""
     count = export_obseq(Survey(load_pipeline(pipeline, overrides)), out)
+    checksums.note([out])
     Console().print(f"wrote {count} visits to {out}", highlight=False, soft_wrap=True)
 
 
@@ -101,6 +105,7 @@ def export_obscore_table(
 ) -> None:
     """Write a table of all stored exposures and tiles in ObsCore's columns, as archives describe observations."""
     count = export_obscore(open_survey(store), out)
+    checksums.note([out])
     Console().print(f"wrote {count} images to {out}", highlight=False, soft_wrap=True)
 
 

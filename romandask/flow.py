@@ -9,10 +9,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 
+from rich.console import Console
+
 from romandask.incoming import source_rows
 from romandask.pipeline import Pipeline
-from romandask.places import files_below, write_bytes
-from romandask.runtime.cluster import Runner
+from romandask.places import Place, files_below, place_of, write_bytes
+from romandask.runtime.cluster import Client, Runner, on_client
 from romandask.runtime.hats import write_catalog_files
 from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
@@ -23,7 +25,7 @@ from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
 from romandask.runtime.store import Store, refuse_full, write_json
 from romandask.runtime.work import Task
-from romandask.stages import Chosen, Product, Stage, stages
+from romandask.stages import Chosen, Product, Stage, plan, stages
 from romandask.survey import Survey
 from romandask.truth import write_spectra
 
@@ -106,6 +108,32 @@ def run(
         for stage in (chosen or Chosen()).of(stages(this.survey)):
             _make_stage(stage, this)
     return this.summary
+
+
+def run_on(client: Client, pipeline: Pipeline, store: Place | str, chosen: Chosen | None = None) -> Summary:
+    """Make and store what is missing, as `romandask run` does, on the cluster that a dask client is connected to.
+
+    Parameters
+    ----------
+    client : of a cluster of any kind, its workers of one thread (pipelines/README.md)
+    store : folder, or s3://BUCKET/FOLDER
+    chosen : stages; None for all
+
+    Returns
+    -------
+    Summary
+        What was made and kept, and what failed. The report is another command, `romandask report`.
+
+    Raises
+    ------
+    UserError
+        If settings or store are not what they should be, or the cluster's workers too small or of another version.
+    """
+    plan(Survey(pipeline))
+    place = Store(place_of(store))
+    runner = on_client(client, pipeline.run.memory_limit)
+    place.prepare()
+    return run(pipeline, place, runner, Reporter(Console()), chosen)
 
 
 def explain(survey: Survey, chosen: Chosen | None = None, retry: bool = False) -> list[Explained]:

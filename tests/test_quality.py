@@ -21,7 +21,7 @@ from romandask.reference import reference
 PACKAGE = ROOT / "romandask"
 _TYPED = (
     "model runtime formats places.py atlas.py reference.py cli.py ingest_commands.py export_commands.py flow.py "
-    "verification.py"
+    "verification.py checksums.py"
 )
 TYPED = [f"romandask/{name}" for name in _TYPED.split()]
 LAYERS = [
@@ -29,7 +29,7 @@ LAYERS = [
     {"ingest_commands", "export_commands"},
     {"export_roman"},
     {"export_images", "atlas"},
-    {"arguments", "reference", "report", "export", "verification"},
+    {"arguments", "reference", "report", "export", "verification", "checksums"},
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},

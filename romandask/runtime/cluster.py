@@ -265,8 +265,7 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
                 f"--scheduler {scheduler}: no dask scheduler answers there ({str(error) or type(error).__name__})"
             ) from None
         with client:
-            _check_workers(client, scheduler, memory_limit)
-            yield OnCluster(client, f"cluster at {scheduler}, dashboard {client.dashboard_link}")
+            yield on_client(client, memory_limit, f"--scheduler {scheduler}")
         return
     settings = yaml.safe_load((resource_folder("pipelines") / "cluster" / "workers.yaml").read_text())
     with (
@@ -277,6 +276,23 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         # a worker that dies while it starts is not started again by dask; to scale to what is wanted starts it
         description = f"{workers} local workers, dashboard {cluster.dashboard_link}"
         yield OnCluster(client, description, lambda: cluster.scale(workers))
+
+
+def on_client(client: Client, memory_limit: float, place: str = "the cluster") -> OnCluster:
+    """Return a runner on the cluster that a client is connected to.
+
+    Parameters
+    ----------
+    memory_limit : GiB a worker
+    place : what an error calls the cluster
+
+    Raises
+    ------
+    UserError
+        If its workers are too small or have another version.
+    """
+    _check_workers(client, place, memory_limit)
+    return OnCluster(client, f"cluster at {client.scheduler.address}, dashboard {client.dashboard_link}")
 
 
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
@@ -300,25 +316,23 @@ def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
     )
 
 
-def _check_workers(client: Client, scheduler: str, memory_limit: float) -> None:
+def _check_workers(client: Client, place: str, memory_limit: float) -> None:
     """Look at the workers that are there: others may come, and go."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
     smallest = min((worker["memory_limit"] or float("inf") for worker in workers), default=float("inf"))
     # what a shell calls 2 GB is 7% less than 2 GiB
     if smallest < 0.93 * memory_limit * 2**30:
         raise UserError(
-            f"--scheduler {scheduler}: a worker has {smallest / 2**30:.2f} GiB, run.memory_limit is {memory_limit:g}: "
+            f"{place}: a worker has {smallest / 2**30:.2f} GiB, run.memory_limit is {memory_limit:g}: "
             "start workers with --memory-limit, or lower run.memory_limit"
         )
     try:
         versions = set(client.run(_version).values())
     except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"--scheduler {scheduler}: a worker cannot load romandask ({error}): install it there"
-        ) from None
+        raise UserError(f"{place}: a worker cannot load romandask ({error}): install it there") from None
     if versions - {version("romandask")}:
         raise UserError(
-            f"--scheduler {scheduler}: a worker has romandask {', '.join(sorted(versions))}, this is "
+            f"{place}: a worker has romandask {', '.join(sorted(versions))}, this is "
             f"{version('romandask')}: install the same everywhere"
         )
 

@@ -23,7 +23,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from conftest import MINI
 
+from romandask import checksums
+from romandask.export import export_meds, export_psf, export_truth
+from romandask.export_images import export_fits, export_moc
+from romandask.export_roman import export_asdf, export_mosaics
 from romandask.model.seeds import rng
+from romandask.model.sky import Cone
 from romandask.runtime.log import events, runs
 from romandask.survey import open_survey
 from romandask.verification import verify
@@ -170,6 +175,39 @@ def damage(store: Path, count: int, random: np.random.Generator) -> None:
     print(f"{count} flips and cuts over {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
 
 
+def damage_exports(store: Path, folder: Path, count: int, random: np.random.Generator) -> None:
+    """The same of exported files, an exposure and a tile in every format."""
+    survey = open_survey(store)
+    roman, tile = survey.exposure_product("roman").names[0], survey.tiles[0]
+    written = export_fits(survey, folder, "roman", [roman], [tile.name], [])
+    written += export_asdf(survey, folder, [roman]) + export_mosaics(survey, folder, [tile.name], [])
+    written += export_truth(survey, folder) + export_psf(survey, folder, [roman]) + export_moc(survey, folder)
+    written += export_meds(survey, folder, Cone(tile.ra, tile.dec, 8.0), [], 32, "truth")
+    checksums.note(written)
+    kinds: Counter[str] = Counter()
+    missed = []
+    for number in range(count):
+        path = written[int(random.integers(len(written)))]
+        size, place = path.stat().st_size, int(random.integers(path.stat().st_size))
+        with open(path, "r+b") as file:
+            file.seek(place)
+            rest = file.read() if number % 4 == 3 else file.read(1)
+            file.seek(place)
+            if number % 4 == 3:
+                file.truncate()
+            else:
+                file.write(bytes([rest[0] ^ 1 << int(random.integers(8))]))
+        if not dict(checksums.check(folder))[path.name]:
+            missed.append(path.name)
+        with open(path, "r+b") as file:
+            file.seek(place)
+            file.write(rest)
+        assert path.stat().st_size == size
+        kinds[path.suffix] += 1
+    assert not any(why for _, why in checksums.check(folder))
+    print(f"{count} flips and cuts over exports {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
+
+
 def full_disk(folder: Path, clean: dict[str, str]) -> None:
     """A disk of too few bytes, then one that may not be written, then room."""
     disk = folder / "disk"
@@ -206,6 +244,8 @@ def main(drivers: int, workers: int, flips: int) -> None:
         print(f"clean run: {len(clean)} units in {length:.0f} s\n  {shlex.join(RUN[3:])}")
         full_disk(folder, clean)
         damage(folder / "clean", flips, random)
+        (folder / "exports").mkdir()
+        damage_exports(folder / "clean", folder / "exports", flips, random)
         kill_workers(folder, clean, workers, random)
         kill_drivers(folder, clean, length, drivers, random)
 

@@ -29,7 +29,7 @@ from romandask.reference import reference as data_products  # noqa: E402
 from romandask.report import dag_svg, write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
 from romandask.runtime.lock import in_use  # noqa: E402
-from romandask.runtime.progress import Reporter, duration  # noqa: E402
+from romandask.runtime.progress import Reporter, busy, duration  # noqa: E402
 from romandask.runtime.store import FULL, Store  # noqa: E402
 from romandask.survey import Survey, open_survey  # noqa: E402
 
@@ -54,7 +54,8 @@ def plan(
 ) -> None:
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
-    rows = stages.plan(Survey(settings))
+    with busy("planning"):
+        rows = stages.plan(Survey(settings))
     table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
@@ -77,7 +78,8 @@ def plan(
 @app.command()
 def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
     """Show what each pixfrac does to the coadds of Roman's dithers, and recommend one; make nothing."""
-    found = coverage(Survey(load_pipeline(pipeline, overrides)).coadd_product("roman"))
+    with busy("drizzling weights"):
+        found = coverage(Survey(load_pipeline(pipeline, overrides)).coadd_product("roman"))
     table = Table("band", "exposures", "pixfrac", "empty pixels", "rms / median of weight", "")
     for one in found:
         cells = (str(one.exposures), f"{one.pixfrac:.1f}", f"{one.empty:.2%}", f"{one.uneven:.3f}")
@@ -162,11 +164,13 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Show it again and again while a run goes on.")] = False,
 ) -> None:
     """Show units done, missing and failed, a line a stage, and what the newest run did last."""
-    survey = open_survey(store)
+    with busy("looking at the store"):
+        survey = open_survey(store)
+        table = _status(survey)
     if not watch:
-        Console().print(_status(survey))
+        Console().print(table)
         return
-    with resumable("no longer watched; the run goes on"), Live(_status(survey), auto_refresh=False) as live:
+    with resumable("no longer watched; the run goes on"), Live(table, auto_refresh=False) as live:
         while in_use(store):
             time.sleep(WATCHED)
             live.update(_status(survey), refresh=True)
@@ -196,13 +200,15 @@ def verify(
             raise UserError(f"{store}: exported files have no stages and no records: verify them without options")
         _verify_files(store)
         return
-    survey, units, damaged = open_survey(store), 0, 0
-    for found in verification.verify(survey, only):
-        units, damaged = units + found.units, damaged + len(found.damaged)
-        for name, why in found.damaged:
-            print(f"damaged: {found.stage}/{name}: {why}")
-        if forget and found.damaged:
-            verification.forget(survey, found)
+    units = damaged = 0
+    with busy("reading every byte"):
+        survey = open_survey(store)
+        for found in verification.verify(survey, only):
+            units, damaged = units + found.units, damaged + len(found.damaged)
+            for name, why in found.damaged:
+                print(f"damaged: {found.stage}/{name}: {why}")
+            if forget and found.damaged:
+                verification.forget(survey, found)
     if damaged:
         print(
             f"{damaged} damaged: " + ("run again, they are made anew" if forget else "verify --forget, then run again")
@@ -212,7 +218,8 @@ def verify(
 
 
 def _verify_files(folder: Path) -> None:
-    found = list(checksums.check(folder))
+    with busy("reading every byte"):
+        found = list(checksums.check(folder))
     damaged = [(name, why) for name, why in found if why]
     for name, why in damaged:
         print(f"damaged: {folder / name}: {why}")
@@ -225,7 +232,9 @@ def _verify_files(folder: Path) -> None:
 @app.command()
 def report(store: StoreArgument) -> None:
     """Write the report, one page without external assets, and say where it is."""
-    Console().print(f"report: {write_report(open_survey(store))}", highlight=False, soft_wrap=True)
+    with busy("writing the report"):
+        path = write_report(open_survey(store))
+    Console().print(f"report: {path}", highlight=False, soft_wrap=True)
 
 
 @app.command()

@@ -20,11 +20,11 @@ from romandask.instruments.roman_focal_plane import SCAS
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
 from romandask.pipeline import load_pipeline
-from romandask.runtime.progress import Reporter
+from romandask.runtime.progress import busy
 from romandask.survey import Survey, open_survey
 
-export_app = typer.Typer(no_args_is_help=True, help="Write a survey's contents in other formats.")
-calibration_app = typer.Typer(no_args_is_help=True, help="Calibration files of Roman's detectors.")
+export_app = typer.Typer(no_args_is_help=True)
+calibration_app = typer.Typer(no_args_is_help=True)
 Folder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files.")]
 Exposures = Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")]
 
@@ -34,6 +34,18 @@ def _wrote(paths: Sequence[Path]) -> None:
     checksums.note(paths)
     for path in paths:
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@export_app.callback()
+def exporting(context: typer.Context) -> None:
+    """Write a survey's contents in other formats."""
+    context.with_resource(busy("exporting"))
+
+
+@calibration_app.callback()
+def calibrating(context: typer.Context) -> None:
+    """Calibration files of Roman's detectors."""
+    context.with_resource(busy("on calibration files"))
 
 
 @export_app.command("truth")
@@ -93,9 +105,8 @@ def export_asdf_images(
 @export_app.command("page")
 def export_page(store: StoreArgument, out: Folder) -> None:
     """Write the coadds as one page to drag and zoom in, both telescopes at the same place: OUT/index.html."""
-    with Reporter(Console()).busy("drawing"):
-        path = export_atlas(open_survey(store), out)
-    _wrote([path])
+    path = export_atlas(open_survey(store), out)
+    Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
 @export_app.command("obscore")

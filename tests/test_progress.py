@@ -3,12 +3,14 @@
 import io
 import json
 import os
+import sys
 import time
 
 import pytest
 from conftest import command
 from rich.console import Console
 
+from romandask.cli import main
 from romandask.runtime import progress
 from romandask.runtime.lock import in_use, locked
 from romandask.runtime.log import Log, events, newest_event, runs
@@ -41,6 +43,20 @@ def test_what_takes_long_says_that_it_goes_on(monkeypatch):
     lines = console.file.getvalue().splitlines()
     assert 1 <= len(lines) <= 4
     assert all(line.startswith("planning: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"), [(["plan", "tiny"], "planning: "), (["export", "obseq", "tiny"], "exporting: ")]
+)
+def test_commands_that_take_long_say_that_they_go_on(words, text, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(progress, "QUIET", 0.2)
+    monkeypatch.setattr(
+        sys, "argv", ["romandask", *words, *([str(tmp_path / "o.fits")] if words[0] == "export" else [])]
+    )
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    assert text in capsys.readouterr().out
 
 
 def test_a_stage_without_a_finished_unit_says_that_it_goes_on(monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -106,6 +106,11 @@ class Reporter:
             pace = Pace(units, cost, time.monotonic())
             with self.busy(lambda: pace.text(name, time.monotonic())):
                 yield _Lines(self, name, pace)
+
+
+def busy(text: str) -> AbstractContextManager[None]:
+    """Write what a command is doing, and for how long, every few seconds that it takes."""
+    return Reporter(Console()).busy(text)
 
 
 class _Bar:

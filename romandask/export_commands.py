@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -29,10 +29,10 @@ Folder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the files
 Exposures = Annotated[list[str], typer.Option("--exposure", help="Name, for example H158-12-7; may be repeated.")]
 
 
-def _wrote(paths: Sequence[Path]) -> None:
-    """Say what was written, and write its checksums beside it."""
-    checksums.note(paths)
+def _wrote(paths: Iterable[Path]) -> None:
+    """Say what was written, as it is, and write its checksums beside it."""
     for path in paths:
+        checksums.note([path])
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

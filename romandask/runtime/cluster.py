@@ -292,7 +292,9 @@ def on_client(client: Client, memory_limit: float, place: str = "the cluster") -
         If its workers are too small or have another version.
     """
     _check_workers(client, place, memory_limit)
-    return OnCluster(client, f"cluster at {client.scheduler.address}, dashboard {client.dashboard_link}")
+    return OnCluster(
+        client, f"cluster at {client.scheduler_info(n_workers=0)['address']}, dashboard {client.dashboard_link}"
+    )
 
 
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -247,6 +248,8 @@ def main() -> None:
     """Run the command line."""
     # when several chunks of a damaged file fail at once, asyncio logs all but the one that is raised
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    # and those that had not begun are warned of
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
         app()
     except OSError as error:

@@ -153,7 +153,7 @@ def test_images_come_back_and_a_chunk_that_is_gone_is_an_error(where, folder, tm
     made = product.write(1, store)
     assert product.verify(1, store) == made.output
     np.testing.assert_array_equal(product.reader(1)("image"), images(3).make(1)["image"])
-    with pytest.raises(FileNotFoundError, match="verify --forget"):
+    with pytest.raises(UserError, match=r"image is damaged \(.*the chunk is gone\): romandask verify --forget"):
         product.reader(2)("image")
 
 

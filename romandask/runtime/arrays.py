@@ -49,9 +49,7 @@ class _Whole(WrapperStore):
         """Return bytes of a key, None where there is no such metadata; FileNotFoundError of a chunk."""
         found = await super().get(key, prototype, byte_range)
         if found is None and _CHUNK.search(key):
-            raise FileNotFoundError(
-                f"{self._store}/{key}: the chunk is gone: romandask verify --forget, then run again"
-            )
+            raise FileNotFoundError(f"{self._store}/{key}: the chunk is gone")
         return found
 
 

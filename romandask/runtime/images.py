@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -16,6 +16,7 @@ import pyarrow as pa
 import xarray as xr
 import zarr
 
+from romandask.model.errors import UserError
 from romandask.places import Place
 from romandask.runtime.arrays import (
     Variable,
@@ -107,10 +108,20 @@ class ImageProduct:
                 opened[name] = _array(group, name)
             index: Any = (*place, ..., *window)
             # what is not compressed has no files in parts: its chunks are read as they are, ten at a time
-            with few_chunks() if opened[name].shards else nullcontext():
+            with self._damage_told(name, unit), few_chunks() if opened[name].shards else nullcontext():
                 return np.asarray(opened[name][index])
 
         return read
+
+    @contextmanager
+    def _damage_told(self, name: str, unit: int) -> Iterator[None]:
+        """Turn what a decoder makes of damaged bytes into a UserError that names the array and the remedy."""
+        try:
+            yield
+        except (FileNotFoundError, ValueError, RuntimeError) as error:
+            found = str(error).splitlines()[0] if str(error) else type(error).__name__
+            what = f"{self.stage} {self.names[unit]}: {name} is damaged ({found})"
+            raise UserError(f"{what}: romandask verify --forget, then run again") from error
 
     def prepare(self, store: Store) -> None:
         """Make the arrays and coordinates that units are written into."""

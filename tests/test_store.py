@@ -59,6 +59,19 @@ def test_a_unit_is_read_only_when_its_record_says_that_it_is_done(tmp_path):
     assert (product.load(0)["image"] == 7.0).all()
 
 
+def test_a_damaged_chunk_is_told_with_its_remedy(tmp_path):
+    store = Store(tmp_path)
+    product = images(2).stored(store)
+    product.prepare(store)
+    product.write(1, store)
+    path = next(path for path in store.images("exposures/x").rglob("image/c/1/**/*") if path.is_file())
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"exposures/x u1: image is damaged \(.+\): romandask verify --forget"):
+        product.reader(1)("image")
+
+
 def test_values_that_are_not_finite_are_never_written(tmp_path):
     store = Store(tmp_path)
     product = images(1)

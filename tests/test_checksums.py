@@ -27,7 +27,7 @@ def exported(tiny_store, tmp_path_factory):
         written += export_mosaics(survey, out, [tile.name], ["H158"])
         written += export_truth(survey, out)
         written += export_psf(survey, out, [exposure])
-        written += export_moc(survey, out)[:1]
+        written += export_moc(survey, out)
         written += export_meds(survey, out, Cone(tile.ra, tile.dec, 8.0), ["H158"], 32, "truth")
         for name in ("images.vot", "images.parquet"):
             export_obscore(survey, out / name)

@@ -196,7 +196,8 @@ def verify(
     ] = False,
 ) -> None:
     """Read every stored byte and compare it with what the manifest says was written; exported files too."""
-    if isinstance(store, Path) and (store / checksums.NAME).is_file():
+    # files may have been exported into the folder of a store, which then is what is meant
+    if isinstance(store, Path) and (store / checksums.NAME).is_file() and not (store / "pipeline.yaml").exists():
         if only or forget:
             raise UserError(f"{store}: exported files have no stages and no records: verify them without options")
         _verify_files(store)

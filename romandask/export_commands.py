@@ -32,7 +32,7 @@ Exposures = Annotated[list[str], typer.Option("--exposure", help="Name, for exam
 def _wrote(paths: Iterable[Path]) -> None:
     """Say what was written, as it is, and write its checksums beside it."""
     for path in paths:
-        checksums.note([path])
+        checksums.note(path)
         Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
@@ -62,7 +62,7 @@ def export_visits(
 ) -> None:
     """Write all Roman visits of a pipeline as an observing sequence (FITS) that GalSim-based tools read."""
     count = export_obseq(Survey(load_pipeline(pipeline, overrides)), out)
-    checksums.note([out])
+    checksums.note(out)
     Console().print(f"wrote {count} visits to {out}", highlight=False, soft_wrap=True)
 
 
@@ -116,7 +116,7 @@ def export_obscore_table(
 ) -> None:
     """Write a table of all stored exposures and tiles in ObsCore's columns, as archives describe observations."""
     count = export_obscore(open_survey(store), out)
-    checksums.note([out])
+    checksums.note(out)
     Console().print(f"wrote {count} images to {out}", highlight=False, soft_wrap=True)
 
 

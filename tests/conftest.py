@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import subprocess
 import sys
@@ -49,6 +50,12 @@ MINI = (
     "truth.galaxies=150", "render.n_waves=3", "roman.psf_degree=0",
 )  # fmt: skip
 """Overrides that make the tiny pipeline a few seconds long."""
+
+
+def outputs(store: Path) -> dict[str, str]:
+    """Content hash of every unit, from the manifest."""
+    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
+    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
 
 
 @pytest.fixture(scope="session")

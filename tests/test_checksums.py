@@ -32,9 +32,8 @@ def exported(tiny_store, tmp_path_factory):
         for name in ("images.vot", "images.parquet"):
             export_obscore(survey, out / name)
             written.append(out / name)
-    # in two parts, as two exports do it
-    checksums.note(written[:3])
-    checksums.note(written[3:])
+    for path in written:
+        checksums.note(path)
     return out
 
 
@@ -74,11 +73,11 @@ def test_a_file_that_is_gone_and_a_damaged_list(exported, tmp_path):
     assert dict(checksums.check(exported))[path.name] == "is gone"
     path.write_bytes(content)
     (tmp_path / "one.txt").write_text("1")
-    checksums.note([tmp_path / "one.txt"])
+    checksums.note(tmp_path / "one.txt")
     listed = (tmp_path / checksums.NAME).read_text()
     (tmp_path / checksums.NAME).write_text(listed.split("\n")[-2] + "\n")
     with pytest.raises(UserError, match="list itself is damaged"):
-        checksums.note([tmp_path / "one.txt"])
+        checksums.note(tmp_path / "one.txt")
 
 
 def test_the_command_line_writes_and_reads_them(tiny_store, tmp_path):
@@ -94,3 +93,12 @@ def test_the_command_line_writes_and_reads_them(tiny_store, tmp_path):
     assert done.returncode == 1
     assert "images.fits: not what was written" in done.stdout
     assert command("verify", str(out), "--forget").returncode == 2
+
+
+def test_files_in_the_folder_of_a_store_do_not_stand_for_the_store(tmp_path):
+    (tmp_path / "one.txt").write_text("1")
+    checksums.note(tmp_path / "one.txt")
+    (tmp_path / "pipeline.yaml").write_text("- not a pipeline\n")
+    done = command("verify", str(tmp_path))
+    assert done.returncode == 2
+    assert "pipeline.yaml" in done.stderr

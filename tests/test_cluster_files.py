@@ -13,7 +13,7 @@ import dask_jobqueue
 import jsonschema
 import pytest
 import yaml
-from conftest import MINI, ROOT
+from conftest import MINI, ROOT, outputs
 from distributed import Client, LocalCluster, Security
 from rich.console import Console
 
@@ -21,7 +21,6 @@ from romandask import flow
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
 from romandask.runtime.cluster import InProcess, runner
-from romandask.runtime.manifest import read_records
 from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
 from romandask.stages import Chosen
@@ -39,12 +38,6 @@ def settings(*names: str, **more):
     """Dask with the settings of some files."""
     with dask.config.set(dask.config.merge(dask.config.config, *map(content, names), more)):
         yield
-
-
-def outputs(store: Path) -> dict[str, str]:
-    place = Store(store)
-    stages = ("truth/structure", "truth/galaxies", "truth/stars", "pointings/roman", "pointings/rubin")
-    return {f"{stage}/{name}": record.output for stage in stages for name, record in read_records(place, stage)}
 
 
 def tool(path: Path, text: str) -> None:

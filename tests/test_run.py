@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import MINI, ROOT, command
+from conftest import MINI, ROOT, command, outputs
 
 STAGES = (
     "truth/galaxies",
@@ -21,12 +21,6 @@ STAGES = (
     "matches/groups",
     "statistics/blends",
 )
-
-
-def outputs(store: Path) -> dict[str, str]:
-    """Content hash of every unit, from the manifest."""
-    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
-    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
 
 
 def products(store: Path) -> dict[str, bytes]:

@@ -6,7 +6,6 @@ A small survey of two telescopes on two workers. Needs the right to mount a tmpf
 without it these two are left out, and it says so.
 """
 
-import json
 import os
 import shlex
 import shutil
@@ -16,12 +15,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from conftest import MINI
+from conftest import MINI, outputs
 
 from romandask import checksums
 from romandask.export import export_meds, export_psf, export_truth
@@ -44,12 +45,6 @@ def start(store: Path) -> subprocess.Popen:
 def finish(store: Path, *more: str) -> tuple[int, str]:
     done = subprocess.run([*RUN, "--store", str(store), *more], capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
-
-
-def outputs(store: Path) -> dict[str, str]:
-    """Hash of every unit, from the manifest."""
-    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
-    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
 
 
 def made(store: Path) -> Counter[str]:
@@ -148,31 +143,33 @@ def kill_workers(folder: Path, clean: dict[str, str], count: int, random: np.ran
     )
 
 
+@contextmanager
+def harmed(path: Path, cut: bool, random: np.random.Generator) -> Iterator[None]:
+    """Change a bit of a file, or cut it; afterwards it is as it was."""
+    content = path.read_bytes()
+    place = int(random.integers(len(content)))
+    changed = bytearray(content)
+    changed[place] ^= 1 << int(random.integers(8))
+    path.write_bytes(content[:place] if cut else changed)
+    try:
+        yield
+    finally:
+        path.write_bytes(content)
+
+
 def damage(store: Path, count: int, random: np.random.Generator) -> None:
-    """Change a bit of a file or cut it, look whether it is found, and put it back."""
+    """Harm files of a store, one at a time, and look whether it is found."""
     files = [path for path in sorted(store.rglob("*")) if path.is_file() and path.stat().st_size]
     files = [path for path in files if path.relative_to(store).parts[0] not in ("report", "log", ".lock")]
-    kinds = Counter()
-    missed = []
-    for number in range(count):
-        path = files[int(random.integers(len(files)))]
-        content = path.read_bytes()
-        changed = bytearray(content)
-        place = int(random.integers(len(content)))
-        if number % 4 == 3:
-            changed = changed[:place]
-        else:
-            changed[place] ^= 1 << int(random.integers(8))
-        path.write_bytes(changed)
+
+    def found(path: Path) -> bool:
         try:
-            found = [name for one in verify(open_survey(store), None) for name, _ in one.damaged]
-        except Exception as error:
-            found = [f"{type(error).__name__} at reading"]
-        if not found:
-            missed.append(str(path.relative_to(store)))
-        kinds[path.suffix or "chunk"] += 1
-        path.write_bytes(content)
-    print(f"{count} flips and cuts over {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
+            return any(one.damaged for one in verify(open_survey(store), None))
+        except Exception:
+            # at reading
+            return True
+
+    harm_and_look("the store", files, found, count, random)
 
 
 def damage_exports(store: Path, folder: Path, count: int, random: np.random.Generator) -> None:
@@ -183,29 +180,25 @@ def damage_exports(store: Path, folder: Path, count: int, random: np.random.Gene
     written += export_asdf(survey, folder, [roman]) + export_mosaics(survey, folder, [tile.name], [])
     written += export_truth(survey, folder) + export_psf(survey, folder, [roman]) + export_moc(survey, folder)
     written += export_meds(survey, folder, Cone(tile.ra, tile.dec, 8.0), [], 32, "truth")
-    checksums.note(written)
+    for path in written:
+        checksums.note(path)
+    harm_and_look("exports", written, lambda path: bool(dict(checksums.check(folder))[path.name]), count, random)
+    assert not any(why for _, why in checksums.check(folder))
+
+
+def harm_and_look(
+    what: str, files: list[Path], found: Callable[[Path], bool], count: int, random: np.random.Generator
+) -> None:
+    """Harm some of the files at random, every fourth time by a cut, and say how often that was found."""
     kinds: Counter[str] = Counter()
     missed = []
     for number in range(count):
-        path = written[int(random.integers(len(written)))]
-        size, place = path.stat().st_size, int(random.integers(path.stat().st_size))
-        with open(path, "r+b") as file:
-            file.seek(place)
-            rest = file.read() if number % 4 == 3 else file.read(1)
-            file.seek(place)
-            if number % 4 == 3:
-                file.truncate()
-            else:
-                file.write(bytes([rest[0] ^ 1 << int(random.integers(8))]))
-        if not dict(checksums.check(folder))[path.name]:
-            missed.append(path.name)
-        with open(path, "r+b") as file:
-            file.seek(place)
-            file.write(rest)
-        assert path.stat().st_size == size
-        kinds[path.suffix] += 1
-    assert not any(why for _, why in checksums.check(folder))
-    print(f"{count} flips and cuts over exports {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
+        path = files[int(random.integers(len(files)))]
+        with harmed(path, number % 4 == 3, random):
+            if not found(path):
+                missed.append(path.name)
+        kinds[path.suffix or "chunk"] += 1
+    print(f"{count} flips and cuts over {what} {dict(kinds)}: {count - len(missed)} found; missed: {missed or 'none'}")
 
 
 def full_disk(folder: Path, clean: dict[str, str]) -> None:

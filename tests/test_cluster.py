@@ -1,5 +1,6 @@
 """Runners: units that come after others, and what becomes of them when one fails."""
 
+import gc
 import os
 import time
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import pandas as pd
 import psutil
 import pyarrow as pa
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 from romandask.model.errors import UserError
 from romandask.runtime import cluster
@@ -148,3 +149,19 @@ def test_a_local_cluster_listens_on_the_loopback_alone():
         ]  # fmt: skip
     assert len(ports) >= 4, "scheduler, dashboard, workers"
     assert {address.ip for address in ports} == {"127.0.0.1"}
+
+
+def test_of_a_client_that_finds_no_scheduler_nothing_is_left():
+    """Collected later, while another one starts, it would wait for ever."""
+    gc.collect()
+    gc.disable()
+    try:
+        with (
+            dask.config.set({"distributed.comm.require-encryption": True}),
+            pytest.raises(UserError, match="encryption required"),
+            runner(1, 2.0, "tcp://127.0.0.1:1"),
+        ):
+            pass
+        assert not [each for each in gc.get_objects() if isinstance(each, Client)]
+    finally:
+        gc.enable()

@@ -14,7 +14,7 @@ import jsonschema
 import pytest
 import yaml
 from conftest import MINI, ROOT, outputs
-from distributed import Client, LocalCluster, Security
+from distributed import LocalCluster, Security
 from rich.console import Console
 
 from romandask import flow
@@ -107,12 +107,10 @@ def test_with_tls_nothing_unencrypted_is_spoken_or_accepted(tmp_path):
         with runner(1, 2.0, address) as found:
             assert address in found.description
         with (
-            pytest.raises(UserError, match="no dask scheduler answers there"),
+            pytest.raises(UserError, match=r"no dask scheduler answers there \(encryption required"),
             runner(1, 2.0, address.replace("tls://", "tcp://")),
         ):
             pass
-        with pytest.raises(RuntimeError, match="encryption required"):
-            Client(address.replace("tls://", "tcp://"), timeout="5s")
 
 
 def test_the_operator_takes_the_cluster_of_kubernetes():

@@ -124,6 +124,9 @@ COMMANDS = {
     "store in the cloud": (["run", "p.yaml", "--store", "gs://bucket/s"], ["gs://bucket/s", "folder"]),
     "store of another scheme": (["run", "p.yaml", "--store", "http://host/s"], ["http://host/s", "folder"]),
     "scheduler of another scheme": ([*RUN, "--scheduler", "http://127.0.0.1:1"], ["http://127.0.0.1:1", "tcp://"]),
+    "scheduler with TLS, no certificates": (
+        [*RUN, "--scheduler", "tls://127.0.0.1:1"], ["tls://127.0.0.1:1", "TLS"],
+    ),
     "scheduler that is none": ([*RUN, "--scheduler", "somewhere"], ["somewhere", "tcp://"]),
     "unknown stage": ([*RUN, "--only", "coads"], ["coads", "coadds"]),
     "from an unknown stage": ([*RUN, "--from", "coadds/euclid"], ["coadds/euclid", "coadds"]),

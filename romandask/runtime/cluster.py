@@ -5,6 +5,7 @@ The only module that knows distributed.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import queue
 import re
@@ -258,13 +259,7 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
     if scheduler is not None:
         if not re.fullmatch(r"(tcp|tls)://\S+:\d+", scheduler):
             raise UserError(f"--scheduler {scheduler}: write tcp://host:port, or tls://host:port")
-        try:
-            client = Client(scheduler, timeout="20s")
-        except (OSError, ValueError, TimeoutError, RuntimeError) as error:
-            raise UserError(
-                f"--scheduler {scheduler}: no dask scheduler answers there ({str(error) or type(error).__name__})"
-            ) from None
-        with client:
+        with _connected(scheduler) as client:
             yield on_client(client, memory_limit, f"--scheduler {scheduler}")
         return
     settings = yaml.safe_load((resource_folder("pipelines") / "cluster" / "workers.yaml").read_text())
@@ -276,6 +271,18 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         # a worker that dies while it starts is not started again by dask; to scale to what is wanted starts it
         description = f"{workers} local workers, dashboard {cluster.dashboard_link}"
         yield OnCluster(client, description, lambda: cluster.scale(workers))
+
+
+def _connected(scheduler: str) -> Client:
+    try:
+        return Client(scheduler, timeout="20s")
+    except (OSError, ValueError, TypeError, TimeoutError, RuntimeError) as error:
+        # TypeError: tls:// without certificates
+        reason = str(error) or type(error).__name__
+    # a client that could not begin closes itself when it is collected: now, for while another one starts in this
+    # process it would wait for ever
+    gc.collect()
+    raise UserError(f"--scheduler {scheduler}: no dask scheduler answers there ({reason})")
 
 
 def on_client(client: Client, memory_limit: float, place: str = "the cluster") -> OnCluster:

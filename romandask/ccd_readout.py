@@ -22,6 +22,7 @@ from romandask.kernels.ccd import (
 )
 from romandask.kernels.cosmic_rays import hits, tracks
 from romandask.kernels.detector import SATURATED
+from romandask.kernels.poisson import poisson
 from romandask.model.seeds import rng
 from romandask.runtime.arrays import Variable
 
@@ -54,7 +55,7 @@ class CcdReadout:
         for block, first in enumerate(range(0, len(light), ROWS)):
             rows = slice(first, first + ROWS)
             mean = np.maximum(light[rows] + background[rows], 0)
-            charge[rows] = self.random(exposure, "light", block).poisson(mean)
+            charge[rows] = poisson(mean, self.random(exposure, "light", block))
         if caught is not None:
             charge += caught
         dq = np.zeros(charge.shape, np.uint16)

@@ -2,44 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import lru_cache, wraps
-from tempfile import TemporaryFile
-from threading import RLock
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import galsim
 import galsim.roman
 import numpy as np
 import pandas as pd
-from galsim.roman import roman_psfs
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.roman_focal_plane import SCAS, corners, header_of
+from romandask.instruments.roman_optics import EXTENT, FOLDS, MIDDLE, WideNodes, edges, optics, over_sca, transforms
 from romandask.instruments.roman_plan import reference_plan
 from romandask.instruments.roman_sun import FURTHEST, NEAREST, sun_angle
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.kernels.detector import Detector
-from romandask.kernels.psf import (
-    CORE,
-    BrightPsf,
-    Grid,
-    PsfModel,
-    Variation,
-    edge_brightness,
-    model,
-    place_grid,
-    sample,
-)
+from romandask.kernels.psf import BrightPsf, Grid, PsfModel, model
 from romandask.model.config import Section, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
 SIDE = galsim.roman.n_pix
+_NEAR = 256
+"""Pixels, a side, that the PSF of one place covers."""
 KNOT_SMOOTHING = 0.2
 """Sigma, arcsec, of the Gaussian that smooths each knot (paper, section 3)."""
 
@@ -163,17 +151,15 @@ class Roman:
     def psf(self, exposure: Exposure) -> PsfModel:
         """Return the PSF of an SCA and band, as it varies over the SCA."""
         sca, degree = exposure.detector, self.settings.psf_degree
-        return _psf(sca, exposure.band, self.n_waves, degree, self.diffusion(sca))
+        return over_sca(sca, exposure.band, self.n_waves, degree, self.diffusion(sca))
 
     def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
         """Return the PSF at one place of the SCA, on stamps of up to 256 pixels."""
         if not self.settings.psf_degree:
-            x, y = _MIDDLE.x - 0.5, _MIDDLE.y - 0.5
+            x, y = MIDDLE
         grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.diffusion(exposure.detector)
-        with _GALSIM:
-            profiles = self.profiles(exposure, x, y)
-            nodes = np.stack([sample(profile, self.pixel_scale, grid, diffusion) for profile in profiles])
-        return model(nodes, grid)
+        waves = self.bandpass(exposure.band).nodes
+        return model(transforms(exposure.detector, exposure.band, waves, 8, (x, y), grid, diffusion), grid)
 
     def psf_key(self, exposure: Exposure) -> tuple:
         """Return what tells PSFs apart: those of an SCA and band are the same in all exposures."""
@@ -181,7 +167,7 @@ class Roman:
 
     def psf_edges(self, exposure: Exposure) -> dict[int, float]:
         """Return how bright a unit star is at the edges of stamps."""
-        return _edges(exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector))
+        return edges(exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector))
 
     def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
         """Return the PSFs of bright stars: of finer pupils, which reach further out (paper, section 4.2)."""
@@ -194,16 +180,15 @@ class Roman:
             place = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
             shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(waves))), 0, 1)
             # of the finest frequencies in the shortest band their cores alone have any
-            grid = Grid(_EXTENT // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
-            nodes = _WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
+            grid = Grid(EXTENT // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
+            nodes = WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
             found.append(BrightPsf(zero * 10 ** (-0.4 * magnitude), grid, nodes, shares))
         return tuple(found)
 
     def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
         """Return GalSim's PSFs at a place (pixels, 0 at the first pixel's centre), one a node."""
-        nodes = roman_bandpass(exposure.band, self.n_waves).nodes
-        place = galsim.PositionD(x + 0.5, y + 0.5)
-        return [_optics(exposure.detector, exposure.band, wave, 8, place) for wave in nodes]
+        waves = self.bandpass(exposure.band).nodes
+        return [optics(exposure.detector, exposure.band, wave, 8, (x, y)) for wave in waves]
 
     def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
         """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current.
@@ -229,104 +214,3 @@ class Roman:
 
 def _date(mjd: float):
     return datetime(1858, 11, 17) + timedelta(days=mjd)
-
-
-# GalSim keeps the pupils of ten SCAs, half a gigabyte; a worker draws one SCA at a time
-roman_psfs._make_aperture.resize(1)
-
-
-FOLDS = {"Y106": 3, "J129": 3, "H158": 2, "F184": 2}
-"""How many times the pixels' Nyquist frequency the optics reach in each band."""
-_EXTENT = 4096
-"""Pixels, a side, that a PSF of the unbinned pupil covers; one of a binned pupil covers so many times less."""
-_NEAR = 256
-"""Pixels, a side, that the PSF of one place covers."""
-_MIDDLE = galsim.PositionD(SIDE / 2, SIDE / 2)
-
-
-_GALSIM = RLock()
-
-
-def _one_thread(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that one thread at a time runs: GalSim keeps the pupil of its last PSF for all threads."""
-
-    @wraps(function)
-    def alone(*arguments: Any) -> Any:
-        with _GALSIM:
-            return function(*arguments)
-
-    return alone
-
-
-def _optics(sca: int, band: str, wave: float, pupil_bin: int, place: galsim.PositionD = _MIDDLE) -> galsim.GSObject:
-    return galsim.roman.getPSF(sca, band, SCA_pos=place, pupil_bin=pupil_bin, wavelength=wave)
-
-
-@lru_cache(maxsize=128)
-@_one_thread
-def _edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, float]:
-    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(_EXTENT // 8, FOLDS[band])
-    ends = [sample(_optics(sca, band, wave, 8), galsim.roman.pixel_scale, grid, diffusion) for wave in waves[[0, -1]]]
-    return edge_brightness(np.array(ends), grid)
-
-
-@lru_cache(maxsize=1)
-@_one_thread
-def _psf(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
-    waves = roman_bandpass(band, n_waves).nodes
-    scale = galsim.roman.pixel_scale
-    grid, core = Grid(_EXTENT // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
-    places = place_grid((SIDE, SIDE), degree) if degree else np.empty((0, 2))
-    nodes = np.empty((n_waves, *grid.shape), np.complex64)
-    differences = np.empty((n_waves, len(places), *core.shape), np.complex64)
-    # by wavelength, for GalSim keeps the pupil of one
-    for node, wave in enumerate(waves):
-        nodes[node] = sample(_optics(sca, band, wave, 8), scale, grid, diffusion)
-        middle = grid.within(nodes[node : node + 1], core.size)[0]
-        for place, (x, y) in enumerate(places):
-            there = _optics(sca, band, wave, 8, galsim.PositionD(x + 0.5, y + 0.5))
-            differences[node, place] = sample(there, scale, core, diffusion) - middle
-    return model(nodes, grid, Variation((SIDE, SIDE), degree, differences) if degree else None)
-
-
-@dataclass(frozen=True)
-class _WideNodes:
-    """The PSFs of a finer pupil, one after another."""
-
-    sca: int
-    band: str
-    waves: tuple[float, ...]
-    """nm"""
-    pupil_bin: int
-    grid: Grid
-    diffusion: float
-
-    def __call__(self) -> Iterator[np.ndarray]:
-        file, size = _wide_samples(self).file, int(np.prod(self.grid.shape))
-        for number in range(len(self.waves)):
-            # another thread may read the same file
-            with _GALSIM:
-                file.seek(number * size * np.dtype(np.complex64).itemsize)
-                samples = np.fromfile(file, np.complex64, size)
-            yield samples.reshape(self.grid.shape)
-
-
-class _Samples:
-    """Transforms one after another in a file without a name, which ends with this, or with the worker."""
-
-    def __init__(self) -> None:
-        self.file = TemporaryFile(prefix="romandask-")
-
-    def __del__(self) -> None:
-        self.file.close()
-
-
-@lru_cache(maxsize=2)
-@_one_thread
-def _wide_samples(nodes: _WideNodes) -> _Samples:
-    """Return the samples of some nodes: long in the making, and large."""
-    samples = _Samples()
-    for wave in nodes.waves:
-        profile = _optics(nodes.sca, nodes.band, wave, nodes.pupil_bin)
-        sample(profile, galsim.roman.pixel_scale, nodes.grid, nodes.diffusion).tofile(samples.file)
-    return samples

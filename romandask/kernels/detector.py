@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from romandask.kernels.poisson import poisson
+
 SATURATED, NO_DATA, PERSISTENCE = 1, 2, 128
 DQ_FLAGS = {"saturated": SATURATED, "no_data": NO_DATA}
 """Bits of the dq plane."""
 TELLING = PERSISTENCE
 """Bits that tell something of a pixel and leave it usable; one with any other is not used."""
-_ROWS = 256
+_ROWS = 64
+"""Rows that are worked on while they are in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ def observe(
     for first in range(0, expected.shape[0], _ROWS):
         rows = slice(first, first + _ROWS)
         # Fourier rendering rings slightly below zero, far below the background
-        mean = np.maximum(expected[rows] + background[rows].astype(np.float64), 0.0)
-        electrons = rng.poisson(mean)
+        mean = np.maximum(expected[rows] + background[rows], np.float32(0))
+        electrons = poisson(mean, rng)
         full = electrons >= detector.saturation
         dq[rows][full] |= SATURATED
         electrons = np.minimum(electrons, detector.saturation)

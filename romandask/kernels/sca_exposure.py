@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from romandask.kernels.brighter_fatter import brighter_fatter
 from romandask.kernels.detector import PERSISTENCE, SATURATED
+from romandask.kernels.poisson import poisson
 from romandask.kernels.sca import (
     STIMULI,
     count_rate_linearity,
@@ -45,12 +45,6 @@ _OF_PIXELS = (
 )  # fmt: skip
 _ROWS = 32
 """Rows that share a random generator, and are worked on while they are in the processor's cache."""
-_SMALL = 20.0
-"""Expected electrons up to which Poisson numbers are found by inversion."""
-_STRIP = 1024
-"""Pixels whose numbers are found together."""
-_ALIKE = 6
-"""Numbers up to this are found for a whole strip."""
 
 Planes = Callable[[str, slice], np.ndarray]
 """Gives some rows of the whole detector (BORDER included) of a named calibration; blocks, whole, where it has those.
@@ -98,7 +92,7 @@ def accumulate(
         mean = _padded(light, rows)
         mean = quantum_efficiency(mean, planes("RELQE1", rows), expand(response.efficiency, 64, rows))
         mean = count_rate_nonlinearity(mean, planes("CRNL", rows)[0].astype(np.float32), response.exptime)
-        caught = generators("light", block).poisson(np.maximum(mean, 0))
+        caught = poisson(np.maximum(mean, 0), generators("light", block))
         charge[rows] = quantum_yield(caught, expand(response.electrons, 128, rows), generators("yield", block))
     if rays is not None:
         charge += rays
@@ -220,48 +214,6 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
         variance[rows] = np.where(lit, (np.maximum(electrons, 0) + read * grown) / safe**2, 0)
         signal[rows] = np.where(lit, light, 0)
     return signal[inner, inner], variance[inner, inner]
-
-
-def poisson(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return Poisson numbers (float32) of mostly small means, by inversion of uniform ones."""
-    uniform = rng.random(mean.shape, np.float32)
-    mean = np.ascontiguousarray(mean, np.float32)
-    found = _invert(mean.ravel(), np.exp(-mean).ravel(), uniform.ravel()).reshape(mean.shape)
-    large = mean > _SMALL
-    found[large] = rng.poisson(mean[large])
-    return found
-
-
-@numba.njit(nogil=True, cache=True)
-def _invert(mean, none, uniform):
-    """Return the numbers whose cumulative probability passes `uniform`; `none` is the probability of none."""
-    over = np.zeros(101, np.float32)
-    for k in range(1, 101):
-        over[k] = 1 / k
-    size = mean.shape[0]
-    out = np.empty(size, np.float32)
-    left, share = np.empty(_STRIP, np.float32), np.empty(_STRIP, np.float32)
-    for first in range(0, size, _STRIP):
-        count = min(_STRIP, size - first)
-        m, found = mean[first : first + count], out[first : first + count]
-        for i in range(count):
-            share[i] = none[first + i]
-            left[i] = uniform[first + i] - share[i] if m[i] <= _SMALL else np.float32(0)
-            found[i] = 0
-        # the first few numbers for all pixels at once, without a branch; the few larger ones one by one
-        for k in range(1, _ALIKE):
-            for i in range(count):
-                found[i] += np.float32(left[i] > 0)
-                share[i] *= m[i] * over[k]
-                left[i] -= share[i]
-        for i in range(count):
-            k = _ALIKE - 1
-            while left[i] > 0 and k < 100:
-                found[i] += 1
-                k += 1
-                share[i] *= m[i] * over[k]
-                left[i] -= share[i]
-    return out
 
 
 def _blocks() -> list[slice]:

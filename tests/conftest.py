@@ -73,6 +73,19 @@ def tiny_store(tmp_path_factory, worker_id) -> Path:
     return folder / "tiny"
 
 
+LONG = (
+    "test_memory.py", "test_tiny.py", "test_run.py", "test_object_store.py", "test_readout.py", "test_accuracy.py",
+    "test_quality.py", "test_cli.py", "test_faults.py", "test_truth.py",
+)  # fmt: skip
+"""Files that take long; the longest single tests first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take long: at the end, one process would run them alone."""
+    places = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+
+
 class SmallSurvey:
     """Three overlapping Roman exposures with detectors of 300 pixels, the truth under them, and tiles."""
 

@@ -257,7 +257,7 @@ def exposures(
         (len(table),),
         coordinates,
         {"survey": instrument.name},
-        # image, truth, dq, background and working copies; the wide PSF of one node, as GalSim samples it or as it is
+        # image, truth, dq, background and working copies; the wide PSF of one node, as it is sampled or as it is
         # drawn; the objects, and the PSFs of a detector and band, the last and the new
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
         # sky, noise and storage, every effect and its calibration; then objects

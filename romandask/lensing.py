@@ -6,6 +6,8 @@ that come after, so that no worker holds more than the galaxies of two.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,18 +202,30 @@ def pair_sums(
     sums = np.zeros((len(SUMS), bins))
     if len(first) and (second is None or len(second)):
         counted = treecorr.GGCorrelation(
-            min_sep=edges[0], max_sep=edges[-1], nbins=bins, sep_units="arcmin", num_threads=1,
+            min_sep=edges[0], max_sep=edges[-1], nbins=bins, sep_units="arcmin",
         )  # fmt: skip
-        if second is None:
-            counted.process_auto(_catalog(first))
-        else:
-            counted.process_cross(_catalog(first), _catalog(second))
+        with _one_thread():
+            if second is None:
+                counted.process_auto(_catalog(first))
+            else:
+                counted.process_cross(_catalog(first), _catalog(second))
         # before they are divided by the weight
         sums = np.stack([counted.npairs, counted.weight, counted.meanr, counted.xip, counted.xim])
         sums[2] /= ARCMIN
     return pd.DataFrame(
         {"first": number, "second": other, "bin": np.arange(bins), **dict(zip(SUMS, sums, strict=True))}
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep TreeCorr to one thread: its catalogs take every core, and beside another worker their threads only wait."""
+    most = treecorr.util.max_omp_threads
+    treecorr.set_max_omp_threads(1)
+    try:
+        yield
+    finally:
+        treecorr.set_max_omp_threads(most)
 
 
 def _catalog(galaxies: pd.DataFrame) -> treecorr.Catalog:

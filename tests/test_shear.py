@@ -12,7 +12,7 @@ import treecorr
 from scipy.special import jv
 
 from romandask.kernels.shear import ELL, bin_means, convergence_power, correlations, covariance, shapes
-from romandask.lensing import MeasureShapes, lensing, patches, separations, significance, two_point
+from romandask.lensing import MeasureShapes, lensing, pair_sums, patches, separations, significance, two_point
 from romandask.model.config import LensingSettings
 from romandask.model.cosmology import Cosmology
 from romandask.model.sky import Region
@@ -239,3 +239,13 @@ def test_stages_over_partitions_make_what_is_made_in_memory():
     assert found["galaxies"].iloc[0] == 3000
     for name in ("separation", "pairs", "xip", "xim", "xip_error", "xip_jackknife", "sigma"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8)
+
+
+def test_pairs_are_counted_by_one_thread_and_treecorr_is_left_as_it_was():
+    """Workers are the parallelism; threads of one would wait for those of another."""
+    treecorr.util.set_omp_threads(4)
+    random = np.random.default_rng(1)
+    rows = pd.DataFrame({name: random.uniform(0, 0.3, 500) for name in ("ra", "dec", "g1", "g2")})
+    pair_sums(0, 1, rows, rows, np.array([1.0, 3.0, 9.0]))
+    assert treecorr.get_omp_threads() == 1
+    assert treecorr.util.max_omp_threads is None

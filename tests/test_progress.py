@@ -49,9 +49,11 @@ def wait_for(text, console):
 def test_what_takes_long_says_that_it_goes_on(monkeypatch):
     monkeypatch.setattr(progress, "QUIET", 0.3)
     console = Console(file=io.StringIO(), width=200)
+    start = time.monotonic()
     with Reporter(console).busy("planning"):
         wait_for("planning: ", console)
     lines = console.file.getvalue().splitlines()
+    assert 1 <= len(lines) <= 1 + (time.monotonic() - start) / progress.QUIET, "no oftener than it should"
     assert all(line.startswith("planning: ") for line in lines)
 
 

@@ -15,7 +15,17 @@ from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.roman_calibration import CalibrationSource
 from romandask.instruments.roman_focal_plane import SCAS, corners, header_of
-from romandask.instruments.roman_optics import EXTENT, FOLDS, MIDDLE, WideNodes, edges, optics, over_sca, transforms
+from romandask.instruments.roman_optics import (
+    EXTENT,
+    FOLDS,
+    MIDDLE,
+    SIDE,
+    WideNodes,
+    edges,
+    optics,
+    over_sca,
+    transforms,
+)
 from romandask.instruments.roman_plan import reference_plan
 from romandask.instruments.roman_sun import FURTHEST, NEAREST, sun_angle
 from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass
@@ -25,7 +35,6 @@ from romandask.model.config import Section, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 
-SIDE = galsim.roman.n_pix
 _NEAR = 256
 """Pixels, a side, that the PSF of one place covers."""
 KNOT_SMOOTHING = 0.2

@@ -111,17 +111,15 @@ def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, floa
 def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     """Return the PSF of an SCA and band, as it varies over the SCA by polynomials of a degree; 0: it does not."""
     waves, lens = roman_bandpass(band, n_waves).nodes, pupil(sca, band, 8)
-    scale = galsim.roman.pixel_scale
     grid, core = Grid(EXTENT // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
     places = place_grid((SIDE, SIDE), degree) if degree else np.empty((0, 2))
-    nodes = np.empty((n_waves, *grid.shape), np.complex64)
+    nodes = transforms(sca, band, waves, 8, MIDDLE, grid, diffusion)
     differences = np.empty((n_waves, len(places), *core.shape), np.complex64)
+    middle = grid.within(nodes, core.size)
     for node, wave in enumerate(waves):
-        nodes[node] = diffraction(lens, wave, grid, scale, diffusion).transform(aberrations(sca, wave, MIDDLE))
-        middle = grid.within(nodes[node : node + 1], core.size)[0]
-        near = diffraction(lens, wave, core, scale, diffusion)
-        for number, (x, y) in enumerate(places):
-            differences[node, number] = near.transform(aberrations(sca, wave, (x, y))) - middle
+        near = diffraction(lens, wave, core, galsim.roman.pixel_scale, diffusion)
+        for number, place in enumerate(places):
+            differences[node, number] = near.transform(aberrations(sca, wave, tuple(place))) - middle[node]
     return model(nodes, grid, Variation((SIDE, SIDE), degree, differences) if degree else None)
 
 

@@ -54,6 +54,8 @@ class Diffraction:
     pupil: Pupil
     size: int
     """Cells along a side of the grid on which the pupil is transformed."""
+    lit: tuple[np.ndarray, np.ndarray]
+    """Rows and columns of the pupil's cells on that grid."""
     across: np.ndarray
     """(size, 2 columns) float32: cosines, then minus sines, from samples of the image to frequencies j_x >= 0."""
     cosines: np.ndarray
@@ -89,10 +91,9 @@ class Diffraction:
         """Return the image (size, size), float32, of light 1, centred on the sample size / 2."""
         pupil = self.pupil
         waves = Zernike(aberrations, R_outer=pupil.radius).evalCartesian(pupil.u, pupil.v)
-        turns = (2 * np.pi * (waves - np.rint(waves))).astype(np.float32)
+        angle = (2 * np.pi * (waves - np.rint(waves))).astype(np.float32)
         field = np.zeros((self.size, self.size), np.complex64)
-        lit = pupil.cells(self.size)
-        field.real[lit], field.imag[lit] = np.cos(turns), np.sin(turns)
+        field.real[self.lit], field.imag[self.lit] = np.cos(angle), np.sin(angle)
         # where the pupil's middle lies changes phases of the light alone
         light = fft.ifft2(field, overwrite_x=True)
         power = fft.fftshift(light.real**2 + light.imag**2)
@@ -127,7 +128,7 @@ def diffraction(pupil: Pupil, wavelength: float, grid: Grid, pixel_scale: float,
     cosines, sines = _waves(place, across[:columns])
     interpolant = [_INTERPOLANT.kval(axis * own) for axis in (up, across)]
     return Diffraction(
-        pupil, size, np.concatenate([cosines, -sines], axis=1), *_waves(across[:rows], place),
+        pupil, size, pupil.cells(size), np.concatenate([cosines, -sines], axis=1), *_waves(across[:rows], place),
         response_of(grid, diffusion) * (interpolant[0][:, None] * interpolant[1][None, :]).astype(np.float32),
     )  # fmt: skip
 

@@ -5,29 +5,26 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 
 from rich.console import Console
 
+from romandask.course import Run, Summary, make
 from romandask.incoming import source_rows
 from romandask.pipeline import Pipeline
-from romandask.places import Place, files_below, place_of, write_bytes
+from romandask.places import Place, place_of, write_bytes
 from romandask.runtime.cluster import Client, Runner, on_client
-from romandask.runtime.hats import write_catalog_files
-from romandask.runtime.images import ImageProduct
 from romandask.runtime.lock import locked
 from romandask.runtime.log import Log, newest_event
 from romandask.runtime.manifest import read_record, read_records
-from romandask.runtime.pending import Pending, drop_strays, failed, pending, write_failure
+from romandask.runtime.pending import failed, pending
 from romandask.runtime.progress import Reporter
-from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
-from romandask.runtime.store import Store, refuse_full, write_json
-from romandask.runtime.work import Task
-from romandask.stages import Chosen, Product, Stage, plan, stages
+from romandask.runtime.sealed import seal
+from romandask.runtime.store import Store, write_json
+from romandask.stages import Chosen, opening, plan, stages
 from romandask.survey import Survey
-from romandask.truth import write_spectra
 
 PACKAGES = (
     "romandask",
@@ -60,35 +57,6 @@ class Explained:
     """Units that would be made, by why."""
 
 
-@dataclass
-class Summary:
-    """What a run did."""
-
-    begun: int = 0
-    """Units that were handed out."""
-    made: dict[str, int] = field(default_factory=dict)
-    kept: dict[str, int] = field(default_factory=dict)
-    failed: list[str] = field(default_factory=list)
-    """stage/unit of units that were set aside, and of those that wait for them."""
-    warnings: Counter[str] = field(default_factory=Counter)
-    """What units warned of, and how many did."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """What the stages of one run share."""
-
-    survey: Survey
-    store: Store
-    runner: Runner
-    reporter: Reporter
-    log: Log
-    retry: bool
-    summary: Summary = field(default_factory=Summary)
-    ends: ExitStack = field(default_factory=ExitStack)
-    """What is to be closed at the end."""
-
-
 def run(
     pipeline: Pipeline,
     store: Store,
@@ -105,8 +73,7 @@ def run(
     retry : make again what failed in an earlier run; else it stays aside until something that it depends on changes
     """
     with _running(pipeline, store, runner, reporter, retry) as this:
-        for stage in (chosen or Chosen()).of(stages(this.survey)):
-            _make_stage(stage, this)
+        make((chosen or Chosen()).of(stages(this.survey)), this)
     return this.summary
 
 
@@ -164,9 +131,7 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     """
     with _running(pipeline, store, runner, reporter, retry=True) as this:
         survey, summary = this.survey, this.summary
-        for stage in stages(survey):
-            if stage.name.startswith("truth/"):
-                _make_stage(stage, this)
+        make([stage for stage in stages(survey) if stage.name.startswith("truth/")], this)
     catalogs = survey.truth_catalogs
     out = sum(int(product.column("n_rows").sum()) for product in (catalogs.galaxies, catalogs.stars))
     aside = {row["stage"]: row["rows"] for row in run_figures(store)}.get("truth/quarantine", 0)
@@ -196,71 +161,6 @@ def _running(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporte
             this.log.write("end", how=end, made=made, kept=kept, failed=len(this.summary.failed))
 
 
-def _make_stage(stage: Stage, this: Run) -> None:
-    with this.reporter.busy(f"{stage.name}: finding what there is to do"):
-        product = stage.product(this.survey)
-        todo = pending(product, this.store, retry=this.retry)
-    _run_stage(stage, product, todo, this)
-    if stage.name == "truth/galaxies":
-        write_spectra(this.survey.truth_catalogs, this.store)
-        seal(this.store, "truth/seds", files_below(this.store.images("truth/seds")))
-
-
-def _run_stage(stage: Stage, product: Product, todo: Pending, this: Run) -> None:
-    store, summary = this.store, this.summary
-    summary.kept[stage.name] = todo.kept
-    summary.failed += [f"{stage.name}/{name} (an input is missing)" for name in todo.blocked]
-    summary.failed += [f"{stage.name}/{name} (set aside, it failed before)" for name in todo.aside]
-    drop_strays(product, store, {product.names[task.index] for task in todo.tasks})
-    made = 0
-    if todo.tasks:
-        unseal(store, stage.name)
-        product.prepare(store)
-        if not summary.begun:
-            this.ends.enter_context(this.runner.recording(this.log.beside(".html")))
-        summary.begun += len(todo.tasks)
-        this.log.write("stage", stage=stage.name, make=len(todo.tasks), keep=todo.kept, blocked=len(todo.blocked))
-        made = _make_units(stage, product, todo.tasks, this)
-    summary.made[stage.name] = made
-    if stage.position is not None and (made or not (store.catalog(product.stage) / "hats.properties").exists()):
-        write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
-    if made or not sealed(store, stage.name):
-        if isinstance(product, ImageProduct):
-            seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
-        elif stage.position is not None:
-            seal(store, stage.name, catalog_files(store, stage.name))
-
-
-def _make_units(stage: Stage, product: Product, tasks: list[Task], this: Run) -> int:
-    """Make units, and return how many there were; those that fail are set aside with the reason.
-
-    Raises
-    ------
-    UserError
-        If the store can take no more: that is no unit's fault, and every other would fail too.
-    """
-    made, known = 0, {task.index: task for task in tasks}
-    # a unit that is made again reads its upstream from the store, never its own former self
-    with this.reporter.stage(stage.name, len(tasks), sum(task.cost for task in tasks)) as meter:
-        for outcome in this.runner.run(product, tasks, this.store):
-            task, name, record = known[outcome.index], product.names[outcome.index], outcome.record
-            meter.advance(task.cost)
-            if record is not None:
-                made += 1
-                figures = {"seconds": record.seconds, "bytes": record.bytes, "rows": record.rows}
-                this.log.write(
-                    "unit", stage=stage.name, unit=name, why=task.why, **figures,
-                    peak_bytes=record.peak_bytes, warnings=record.warnings,
-                )  # fmt: skip
-                this.summary.warnings.update(record.warnings)
-                continue
-            refuse_full(outcome.error, this.store)
-            this.summary.failed.append(f"{stage.name}/{name}")
-            write_failure(this.store, product.stage, name, task.inputs, str(outcome.failure))
-            this.log.write("failed", stage=stage.name, unit=name, why=task.why, reason=str(outcome.failure))
-    return made
-
-
 def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     """Return (stage, units, done, failed) of every stage of a store; units is -1 where it is not known yet."""
     store = survey.store
@@ -269,8 +169,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     for stage in stages(survey):
         aside = len(failed(store, stage.name))
         done = len(store.recorded(stage.name))
-        known = stage.name.startswith(("truth/", "pointings/"))
-        if known or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
+        if opening(stage.name) or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
         else:
             units = -1

@@ -53,6 +53,16 @@ class Chosen:
         return [stage for stage in every[first:] if not self.only or any(_is(stage, name) for name in self.only)]
 
 
+def opening(stage: str) -> bool:
+    """True of stages that must be there before the units of those after them are known."""
+    return stage.startswith(("truth/", "pointings/"))
+
+
+def reads(product: Product) -> frozenset[str]:
+    """Return the names of the stages whose units those of a product are made from."""
+    return frozenset(stage for unit in product.units for stage, _ in (*unit.inputs, *unit.optional))
+
+
 def _is(stage: Stage, name: str) -> bool:
     return name in (stage.name, stage.name.split("/")[0])
 
@@ -102,11 +112,6 @@ def stages(survey: Survey) -> list[Stage]:
         for name, instrument in survey.instruments.items()
         if instrument.coadd != "draw"
     ]
-    found += [
-        Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
-        for name, instrument in survey.instruments.items()
-        if instrument.coadd != "draw"
-    ]
     for kind in ("coadd", "detection"):
         found += [
             Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
@@ -142,6 +147,12 @@ def stages(survey: Survey) -> list[Stage]:
             Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
             for part in ("blends", "unrecognised", "distributions", "chance")
         ]
+    # nothing waits for it: it is made where other stages leave workers free
+    found += [
+        Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
+        for name, instrument in survey.instruments.items()
+        if instrument.coadd != "draw"
+    ]
     return found
 
 

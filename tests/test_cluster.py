@@ -16,12 +16,13 @@ from distributed import Client, LocalCluster
 
 from romandask.model.errors import UserError
 from romandask.runtime import cluster
-from romandask.runtime.cluster import ATTEMPTS, runner
+from romandask.runtime.cluster import runner
 from romandask.runtime.order import Waiting
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
-from romandask.runtime.work import Task
+from romandask.runtime.waves import ATTEMPTS
+from romandask.runtime.work import Batch, Task
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def test_units_after_one_that_fails_are_given_up_and_named_and_others_are_made(t
     tasks = [Task(k, "inputs", 1.0, "", after.get(k, ())) for k in range(6)]
     store = Store(tmp_path / "store")
     with runner(workers, 1.5) as execution:
-        outcomes = {outcome.index: outcome for outcome in execution.run(product, tasks, store)}
+        outcomes = {outcome.index: outcome for outcome in execution.run(Batch(product, tasks, store))}
     assert sorted(outcomes) == [0, 1, 2, 3, 4, 5]
     assert {k for k, outcome in outcomes.items() if outcome.record is None} == {1, 2, 3, 4}
     assert "ArithmeticError: unit 1 cannot be made" in outcomes[1].failure
@@ -79,7 +80,7 @@ def test_the_last_of_a_few_long_units_does_not_wait_behind_another(tmp_path):
     store = Store(tmp_path / "store")
     with runner(2, 1.5) as execution:
         tasks = [Task(k, "inputs", 1.0, f"kin {k % 2}") for k in range(3)]
-        found = list(execution.run(product, tasks, store))
+        found = list(execution.run(Batch(product, tasks, store)))
     assert all(outcome.record for outcome in found)
     processes = [product.stored(store).load(k)["process"].iloc[0] for k in range(3)]
     assert len(set(processes)) == 2
@@ -119,7 +120,7 @@ def test_workers_that_die_before_they_begin_are_started_again(monkeypatch):
     with runner(1, 1.5) as execution:
         assert "1 local workers" in execution.description
     assert starts == [1, 1, 1]
-    monkeypatch.setattr(cluster, "ATTEMPTS", 2)
+    monkeypatch.setattr(cluster, "STARTS", 2)
     starts.clear()
     with pytest.raises(UserError, match="Nanny failed to start"), runner(1, 1.5):
         pass
@@ -134,7 +135,7 @@ def test_local_workers_that_are_gone_for_good_are_started_again(tmp_path):
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}), runner(1, 1.5) as execution:
         execution._client.retire_workers(close_workers=True)
         assert not execution._client.scheduler_info()["workers"]
-        outcomes = list(execution.run(product, tasks, Store(tmp_path / "store")))
+        outcomes = list(execution.run(Batch(product, tasks, Store(tmp_path / "store"))))
     assert all(outcome.record is not None for outcome in outcomes)
     assert len(outcomes) == 3
 

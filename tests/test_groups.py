@@ -17,7 +17,7 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
-from romandask.runtime.work import Task
+from romandask.runtime.work import Batch, Task
 
 REGION = Region(359.99, 0.01, -0.01, 0.01)
 
@@ -90,7 +90,7 @@ def stored_matches(products, settings: MatchSettings, folder, kind: str = "match
     made = matches(products, settings, REGION, store, kind, shift)
     for product in (made.local, made.crossing, made.merged, made.groups):
         tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-        assert all(outcome.record for outcome in InProcess().run(product, tasks, store))
+        assert all(outcome.record for outcome in InProcess().run(Batch(product, tasks, store)))
     return made
 
 

@@ -23,14 +23,25 @@ from romandask.survey import Survey
 def test_what_is_left_goes_by_cost_not_by_number():
     """The dear units go first: after one of four, with nine tenths of the cost, a tenth is left."""
     pace = Pace(units=4, cost=10.0, start=100.0)
-    assert pace.left(120.0) is None
-    pace.advance(9.0)
-    assert pace.left(190.0) == pytest.approx(10.0)
-    assert "1/4 units" in pace.text("coadds/roman", 190.0)
-    assert "about 10 s left" in pace.text("coadds/roman", 190.0)
+    assert pace.left() is None
+    pace.advance(9.0, now=190.0)
+    assert pace.left() == pytest.approx(10.0)
+    assert "1/4 units  90.0 s, about 10 s left" in pace.text("coadds/roman", 190.0)
     for _ in range(3):
-        pace.advance(1 / 3)
+        pace.advance(1 / 3, now=200.0)
     assert "left" not in pace.text("coadds/roman", 200.0)
+
+
+def test_what_is_left_does_not_count_the_time_that_others_had_the_workers():
+    """Ten units of two seconds, of which one was made at once and one after ten minutes: eight are left."""
+    pace = Pace(units=10, cost=10.0, start=100.0)
+    pace.advance(1.0, now=102.0, seconds=2.0)
+    pace.advance(1.0, now=700.0, seconds=2.0)
+    assert pace.left() == pytest.approx(16.0)
+    # two workers: the next ones end a second after one another
+    for now in (701.0, 702.0):
+        pace.advance(1.0, now=now, seconds=2.0)
+    assert pace.left() == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(3.2, "3 s"), (89, "89 s"), (600, "10 min"), (9000, "2.5 h")])
@@ -44,6 +55,17 @@ def wait_for(text, console):
     while text not in console.file.getvalue():
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+class Since:
+    """What a console has written after some characters."""
+
+    def __init__(self, console, start):
+        self._console, self._start = console, start
+        self.file = self
+
+    def getvalue(self):
+        return self._console.file.getvalue()[self._start :]
 
 
 def test_what_takes_long_says_that_it_goes_on(monkeypatch):
@@ -84,22 +106,34 @@ def test_commands_that_take_long_say_that_they_go_on(words, module, text, monkey
     assert text in capsys.readouterr().out
 
 
-def test_a_stage_without_a_finished_unit_says_that_it_goes_on(monkeypatch):
+def test_stages_without_a_finished_unit_say_that_they_go_on(monkeypatch):
     monkeypatch.setattr(progress, "QUIET", 0.3)
     console = Console(file=io.StringIO(), width=200)
-    with Reporter(console).stage("coadds/roman", 2, 3.0) as meter:
+    with Reporter(console).board() as board:
+        meter, other = board.begin("coadds/roman", 2, 3.0), board.begin("truth_index/roman", 3, 3.0)
         wait_for("0/2 units", console)
+        wait_for("0/3 units", console)
         meter.advance(2.0)
         meter.advance(1.0)
-    assert "2/2 units" in console.file.getvalue()
+        ended = console.file.getvalue()
+        assert "2/2 units" in ended
+        wait_for("0/3 units", Since(console, len(ended)))
+        assert "coadds" not in console.file.getvalue()[len(ended) :], "of what has ended nothing more is said"
+        for _ in range(3):
+            other.advance(1.0)
+    assert "3/3 units" in console.file.getvalue()
 
 
-def test_a_bar_counts_units(monkeypatch):
+def test_bars_are_of_what_is_under_way_and_lines_of_what_is_done():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
-    with Reporter(console).stage("coadds/roman", 2, 3.0) as meter:
+    with Reporter(console).board() as board:
+        meter, other = board.begin("coadds/roman", 2, 3.0), board.begin("truth_index/roman", 3, 3.0)
         meter.advance(2.0)
         meter.advance(1.0)
-    assert "2/2" in console.file.getvalue()
+        other.advance(1.0)
+    written = console.file.getvalue()
+    assert "2/2 units" in written
+    assert written.rindex("1/3") > written.rindex("2/2"), "the bar of what was not done stays at the end"
 
 
 def test_a_log_that_was_cut_ends_before_the_cut(tmp_path):

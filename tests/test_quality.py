@@ -33,6 +33,7 @@ LAYERS = [
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},
+    {"course"},
     {"stages"},
     {"survey"},
     {"survey_products"},

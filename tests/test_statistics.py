@@ -15,7 +15,7 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
-from romandask.runtime.work import Task
+from romandask.runtime.work import Batch, Task
 from romandask.samples import limits, samples
 from romandask.statistics import Samples, matrix, statistics
 
@@ -116,7 +116,7 @@ def made(sky, settings: MatchSettings, folder):
 
     def stored(product: TableProduct) -> TableProduct:
         tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-        for outcome in InProcess().run(product, tasks, store):
+        for outcome in InProcess().run(Batch(product, tasks, store)):
             assert outcome.record, outcome.failure
         return product.stored(store)
 

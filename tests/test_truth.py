@@ -28,7 +28,7 @@ from romandask.runtime.cluster import InProcess
 from romandask.runtime.hats import WIDTH, margin, write_catalog_files
 from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
-from romandask.runtime.work import Task
+from romandask.runtime.work import Batch, Task
 from romandask.stages import stages
 from romandask.survey import Survey
 from romandask.truth import truth
@@ -51,7 +51,7 @@ def sample(shared, **settings):
 def stored(product, store):
     """The product with all its units and HATS files in a store."""
     tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-    outcomes = list(InProcess().run(product, tasks, store))
+    outcomes = list(InProcess().run(Batch(product, tasks, store)))
     assert all(outcome.record for outcome in outcomes), [outcome.failure for outcome in outcomes]
     if product.pixels is not None:
         write_catalog_files(product, store)

@@ -6,17 +6,14 @@ The only module that knows distributed.
 from __future__ import annotations
 
 import gc
-import itertools
 import queue
 import re
 import socket
 import time
 import traceback
-import uuid
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,42 +26,34 @@ from distributed import Client, LocalCluster, performance_report
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.places import Place, write_bytes
-from romandask.runtime.images import ImageProduct
-from romandask.runtime.manifest import Record
 from romandask.runtime.order import Waiting
-from romandask.runtime.store import Store
-from romandask.runtime.tables import TableProduct
-from romandask.runtime.work import Task, make_unit
+from romandask.runtime.waves import Wave, hand_out
+from romandask.runtime.work import Batch, Outcome, given_up, make_unit
 
-ATTEMPTS = 3
-"""A unit that fails this often is set aside."""
+STARTS = 3
+"""Times that local workers are started before a run gives up."""
 PATIENCE = 60.0
 """Seconds that a run waits for a cluster without workers."""
-WAVE = 4
-"""Units in flight a thread of a worker: enough to keep it busy, few enough that nothing piles up."""
-LONG = 5.0
-"""Seconds: longer units are given out one a thread, to those that are free. One that waits behind another on its
-worker stays there, for dask moves only units of a kind that it has timed, and others would end with nothing to do."""
+More = Callable[[], Iterable[Batch]]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a unit: its record, or the text of its last failure."""
-
-    index: int
-    record: Record | None
-    failure: str | None = None
-    error: BaseException | None = None
-    """What was raised, where it is known."""
+def _no_more() -> Iterable[Batch]:
+    return ()
 
 
 class Runner(Protocol):
-    """Runs the units of a product."""
+    """Runs the units of stages."""
 
     description: str
 
-    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
-        """Yield what became of each unit, as they end."""
+    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
+        """Yield what became of each unit, as they end.
+
+        Parameters
+        ----------
+        begin : what is to be made
+        more : asked at the beginning, and when what was yielded has been taken, for what can be made now
+        """
 
     def recording(self, path: Place) -> AbstractContextManager[Any]:
         """Write, at the end of the context, a page with what the cluster did in it."""
@@ -79,20 +68,28 @@ class InProcess:
         """Write nothing: there is no cluster."""
         return nullcontext()
 
-    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
-        """Yield what became of each unit; a failure is not tried again."""
-        waiting = Waiting([replace(task, cost=0.0) for task in tasks])
-        while waiting:
-            task = waiting.next()
-            try:
-                yield Outcome(task.index, make_unit(product, task, store))
-            except Exception as error:
-                yield Outcome(task.index, None, traceback.format_exc(), error)
-                yield from _given_up(product, task.index, waiting)
+    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
+        """Yield what became of each unit, a stage after the other; a failure is not tried again."""
+        batches = [*begin, *more()]
+        while batches:
+            batches.sort(key=lambda batch: batch.rank)
+            yield from _one_by_one(batches.pop(0))
+            batches += more()
+
+
+def _one_by_one(batch: Batch) -> Iterator[Outcome]:
+    product, waiting = batch.product, Waiting([replace(task, cost=0.0) for task in batch.tasks])
+    while waiting:
+        task = waiting.next()
+        try:
+            yield Outcome(product.stage, task.index, make_unit(product, task, batch.store))
+        except Exception as error:
+            yield Outcome(product.stage, task.index, None, traceback.format_exc(), error)
+            yield from given_up(product, task.index, waiting.give_up(task.index))
 
 
 class OnCluster:
-    """Runs units on a dask cluster, in bounded waves, long units first; results are released at once."""
+    """Runs units on a dask cluster, those of several stages side by side; results are released at once."""
 
     def __init__(self, client: Client, description: str, restart: Callable[[], None] | None = None):
         self._client = client
@@ -103,77 +100,27 @@ class OnCluster:
         """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
         return _recording(self._client, path)
 
-    def run(self, product: ImageProduct | TableProduct, tasks: list[Task], store: Store) -> Iterator[Outcome]:
+    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
         """Yield what became of each unit; one that fails is tried up to three times."""
-        waiting = Waiting(tasks)
-        tries = {task.index: 0 for task in tasks}
-        # the product goes to every worker once; a task carries only its number and its hash. It is the result of a
-        # task, not scattered data: when the workers that hold it die the scheduler can make it again
-        name = product.stage.replace("/", "-")
-        token = uuid.uuid4().hex[:8]
-        shared = self._client.submit(_itself, product, key=f"{name}-product-{token}")
-        flying: dict[int, Any] = {}
-        futures: dict[Any, Task] = {}
-        missing = {task.index for task in tasks}
-        failed: set[int] = set()
-        number = itertools.count()
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-
-        places: dict[Any, str] = {}
-        known: dict[str, str] = {}
-
-        def submit() -> None:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-            threads = {address: worker["nthreads"] for address, worker in workers.items()}
-            total = max(1, sum(threads.values()))
-            long = product.seconds_per_unit > LONG
-            held = sum(any(k in flying for k in task.after) for task in futures.values())
-            while waiting and len(futures) < WAVE * total and len(futures) - held < (total if long else WAVE * total):
-                place = _freest(threads, places) if long else None
-                busy = {task.kin for task in futures.values()}
-                # what a worker knows of a kin, the PSFs of a detector for example, it need not find again
-                task = waiting.next(known.get(place), busy) if place else waiting.next()
-                tries[task.index] += 1
-                key = f"{name}-{product.names[task.index]}-{token}-{next(number)}"
-                # an edge of the graph for each unit that it comes after and that is not there yet
-                after = [flying[k] for k in task.after if k in flying]
-                where: dict[str, Any] = {"workers": [place], "allow_other_workers": True} if place else {}
-                future = self._client.submit(make_unit, shared, task, store, *after, key=key, pure=False, **where)
-                flying[task.index] = future
-                futures[future] = task
-                if place:
-                    places[future], known[place] = place, task.kin
-                held += bool(after)
-                future.add_done_callback(ended.put)
-
+        waves = [Wave(self._client, batch, ended.put) for batch in begin]
         try:
-            submit()
-            while futures:
+            while True:
+                waves += [Wave(self._client, batch, ended.put) for batch in more()]
+                waves = sorted(filter(None, waves), key=lambda wave: wave.batch.rank)
+                if not waves:
+                    return
+                hand_out(waves, self._threads())
                 future = self._next(ended)
-                task = futures.pop(future)
-                del flying[task.index]
-                places.pop(future, None)
-                if future.status == "finished":
-                    missing.discard(task.index)
-                    yield Outcome(task.index, future.result())
-                elif missing.intersection(task.after) and not failed.intersection(task.after):
-                    # it failed with one that it waited for, not by itself
-                    tries[task.index] -= 1
-                    waiting.again(task)
-                elif tries[task.index] < ATTEMPTS and not failed.intersection(task.after):
-                    waiting.again(task)
-                else:
-                    before = failed.intersection(task.after)
-                    text = _after_failed(product, min(before)) if before else _failure(future)
-                    yield Outcome(task.index, None, text, future.exception() if future.status == "error" else None)
-                    given_up = _given_up(product, task.index, waiting)
-                    failed |= {task.index, *(outcome.index for outcome in given_up)}
-                    yield from given_up
-                future.release()
-                submit()
+                yield from next(wave for wave in waves if future in wave.flown).settle(future)
         finally:
-            if futures:
-                self._client.cancel(list(futures), force=True)
+            left = [future for wave in waves for future in wave.flown]
+            if left:
+                self._client.cancel(left, force=True)
+
+    def _threads(self) -> dict[str, int]:
+        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        return {address: worker["nthreads"] for address, worker in workers.items()}
 
     def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
         """Return the next task that ends; UserError where no worker is left for a minute to end one."""
@@ -183,7 +130,7 @@ class OnCluster:
                 return ended.get(timeout=2.0)
             except queue.Empty:
                 self._restart()
-                if self._client.scheduler_info(n_workers=-1)["workers"]:
+                if self._threads():
                     alone_since = None
                     continue
                 alone_since = alone_since or time.monotonic()
@@ -211,33 +158,6 @@ def _recording(client: Client, path: Place) -> Iterator[None]:
                 # but for its icon the page needs nothing from elsewhere
                 page = re.sub(r'<link rel="shortcut icon"[^>]*>', "", temporary.read_text(encoding="utf-8"))
                 write_bytes(path, page.encode())
-
-
-def _given_up(product: ImageProduct | TableProduct, failed: int, waiting: Waiting) -> list[Outcome]:
-    text = _after_failed(product, failed)
-    return [Outcome(task.index, None, text) for task in waiting.give_up(failed)]
-
-
-def _after_failed(product: ImageProduct | TableProduct, failed: int) -> str:
-    return f"{product.names[failed]}, which comes before it, failed\n"
-
-
-def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:
-    return product
-
-
-def _freest(threads: dict[str, int], places: dict[Any, str]) -> str | None:
-    """Return the worker with the fewest tasks a thread; None without workers."""
-    tasks = Counter(places.values())
-    return min(threads, key=lambda address: tasks[address] / max(1, threads[address]), default=None)
-
-
-def _failure(future: Any) -> str:
-    if future.status != "error":
-        return f"the task was {future.status}: its worker died, perhaps for want of memory\n"
-    error = future.exception()
-    lines = traceback.format_exception(type(error), error, future.traceback())
-    return "".join(lines)
 
 
 @contextmanager
@@ -307,7 +227,7 @@ def on_client(client: Client, memory_limit: float, place: str = "the cluster") -
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
     """Start processes of one thread on the loopback; again where one dies before it has begun."""
     reason = ""
-    for _ in range(ATTEMPTS):
+    for _ in range(STARTS):
         try:
             return LocalCluster(
                 n_workers=workers,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -21,8 +22,8 @@ QUIET = 8.0
 class Meter(Protocol):
     """Counts the units of a stage."""
 
-    def advance(self, cost: float) -> None:
-        """Count one more unit, and its cost."""
+    def advance(self, cost: float, seconds: float = math.inf) -> None:
+        """Count one more unit, its cost, and how long it took."""
 
 
 @dataclass
@@ -37,21 +38,26 @@ class Pace:
     done: int = 0
     spent: float = 0.0
     """Cost of the units that are done."""
+    worked: float = 0.0
+    """Seconds in which units of it were made: other stages may have had the workers in between."""
+    last: float = 0.0
+    """When the last one was done."""
 
-    def advance(self, cost: float) -> None:
-        """Count one more unit."""
-        self.done += 1
-        self.spent += cost
+    def advance(self, cost: float, now: float, seconds: float = math.inf) -> None:
+        """Count one more unit, that was done now and took some seconds."""
+        self.worked += min(now - (self.last or self.start), seconds)
+        self.done, self.spent, self.last = self.done + 1, self.spent + cost, now
 
-    def left(self, now: float) -> float | None:
-        """Return seconds until the stage is done; None where nothing is done yet by which to tell."""
-        return (now - self.start) * (self.cost - self.spent) / self.spent if self.spent > 0 else None
+    def left(self) -> float | None:
+        """Return seconds of work until the stage is done; None where it is, or nothing by which to tell."""
+        known = self.spent > 0 and self.done < self.units
+        return self.worked * (self.cost - self.spent) / self.spent if known else None
 
     def text(self, name: str, now: float) -> str:
         """Return one line."""
         line = f"{name:20s} {self.done}/{self.units} units  {now - self.start:.1f} s"
-        left = self.left(now)
-        return line if left is None or self.done >= self.units else f"{line}, about {duration(left)} left"
+        left = self.left()
+        return line if left is None else f"{line}, about {duration(left)} left"
 
 
 def duration(seconds: float) -> str:
@@ -75,13 +81,18 @@ class Reporter:
 
     @contextmanager
     def busy(self, text: Callable[[], str] | str) -> Iterator[None]:
-        """Write what is being done, and for how long, whenever nothing has been written for some seconds."""
+        """Write what is being done, and for how long, whenever nothing has been written for some seconds.
+
+        Where `text` returns nothing, there is nothing to say.
+        """
         ended, start = threading.Event(), time.monotonic()
 
         def watch() -> None:
             while not ended.wait(0.5):
                 if (now := time.monotonic()) - self._said > QUIET:
-                    self.say(text() if callable(text) else f"{text}: {duration(now - start)}")
+                    line = text() if callable(text) else f"{text}: {duration(now - start)}"
+                    if line:
+                        self.say(line)
 
         thread = threading.Thread(target=watch, daemon=True)
         thread.start()
@@ -92,20 +103,28 @@ class Reporter:
             thread.join()
 
     @contextmanager
-    def stage(self, name: str, units: int, cost: float) -> Iterator[Meter]:
-        """Show the progress of a stage of some units, of a cost in all."""
+    def board(self) -> Iterator[Board]:
+        """Show the progress of stages, several of which may be under way."""
         if self.console.is_terminal:
             columns = (
                 TextColumn("{task.description:18s}"), BarColumn(),
-                TextColumn("{task.fields[done]}/{task.fields[units]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+                TextColumn("{task.fields[done]}/{task.fields[units]}"), TimeElapsedColumn(),
+                TextColumn("{task.fields[left]}"),
             )  # fmt: skip
             with Progress(*columns, console=self.console) as progress:
-                yield _Bar(progress, name, units, cost)
+                yield _Bars(self, progress)
             self._said = time.monotonic()
         else:
-            pace = Pace(units, cost, time.monotonic())
-            with self.busy(lambda: pace.text(name, time.monotonic())):
-                yield _Lines(self, name, pace)
+            lines = _Lines(self)
+            with self.busy(lines.text):
+                yield lines
+
+
+class Board(Protocol):
+    """The progress of the stages that are under way."""
+
+    def begin(self, name: str, units: int, cost: float) -> Meter:
+        """Show a stage of some units, of a cost in all, until all of them are counted."""
 
 
 def busy(text: str) -> AbstractContextManager[None]:
@@ -113,24 +132,54 @@ def busy(text: str) -> AbstractContextManager[None]:
     return Reporter(Console()).busy(text)
 
 
-class _Bar:
-    def __init__(self, progress: Progress, name: str, units: int, cost: float):
-        self._progress, self._done = progress, 0
-        self._task = progress.add_task(name, total=cost, done=0, units=units)
+class _Bars:
+    def __init__(self, reporter: Reporter, progress: Progress):
+        self._reporter, self._progress = reporter, progress
 
-    def advance(self, cost: float) -> None:
-        self._done += 1
-        self._progress.update(self._task, advance=cost, done=self._done)
+    def begin(self, name: str, units: int, cost: float) -> Meter:
+        return _Bar(self._reporter, self._progress, name, Pace(units, cost, time.monotonic()))
+
+
+class _Bar:
+    def __init__(self, reporter: Reporter, progress: Progress, name: str, pace: Pace):
+        self._reporter, self._progress, self._name, self._pace = reporter, progress, name, pace
+        self._task = progress.add_task(name, total=pace.cost, done=0, units=pace.units, left="")
+
+    def advance(self, cost: float, seconds: float = math.inf) -> None:
+        self._pace.advance(cost, time.monotonic(), seconds)
+        left = self._pace.left()
+        text = "" if left is None else f"{duration(left)} left"
+        self._progress.update(self._task, advance=cost, done=self._pace.done, left=text)
+        if self._pace.done == self._pace.units:
+            # bars are of what is under way; of what is done one line stays
+            self._progress.remove_task(self._task)
+            self._reporter.say(self._pace.text(self._name, time.monotonic()))
 
 
 class _Lines:
-    def __init__(self, reporter: Reporter, name: str, pace: Pace):
-        self._reporter, self._name, self._pace = reporter, name, pace
+    def __init__(self, reporter: Reporter):
+        self._reporter = reporter
+        self._going: dict[str, Pace] = {}
+
+    def begin(self, name: str, units: int, cost: float) -> Meter:
+        pace = self._going[name] = Pace(units, cost, time.monotonic())
+        return _Line(self._reporter, name, pace, self._going)
+
+    def text(self) -> str:
+        return "\n".join(pace.text(name, time.monotonic()) for name, pace in self._going.copy().items())
+
+
+class _Line:
+    def __init__(self, reporter: Reporter, name: str, pace: Pace, going: dict[str, Pace]):
+        self._reporter, self._name, self._pace, self._going = reporter, name, pace, going
         self._last = pace.start
 
-    def advance(self, cost: float) -> None:
-        self._pace.advance(cost)
+    def advance(self, cost: float, seconds: float = math.inf) -> None:
         now = time.monotonic()
-        if self._pace.done == self._pace.units or now - self._last > INTERVAL:
+        self._pace.advance(cost, now, seconds)
+        done = self._pace.done == self._pace.units
+        if done:
+            del self._going[self._name]
+        if done or now - self._last > INTERVAL:
             self._last = now
             self._reporter.say(self._pace.text(self._name, now))

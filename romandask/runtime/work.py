@@ -31,6 +31,39 @@ class Task:
     """The reason for which it is made."""
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Units of one stage that are to be made."""
+
+    product: ImageProduct | TableProduct
+    tasks: list[Task]
+    store: Store
+    rank: int = 0
+    """Units of a lower one are handed out first."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a unit: its record, or the text of its last failure."""
+
+    stage: str
+    index: int
+    record: Record | None
+    failure: str | None = None
+    error: BaseException | None = None
+    """What was raised, where it is known."""
+
+
+def given_up(product: ImageProduct | TableProduct, failed: int, lost: list[Task]) -> list[Outcome]:
+    """Return what became of the units that come after one that failed."""
+    return [Outcome(product.stage, task.index, None, after_failed(product, failed)) for task in lost]
+
+
+def after_failed(product: ImageProduct | TableProduct, failed: int) -> str:
+    """Return why a unit was not made that comes after one that failed."""
+    return f"{product.names[failed]}, which comes before it, failed\n"
+
+
 def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *after: Record) -> Record:
     """Make and write one unit, then its record: what a crash leaves in between is made again.
 

@@ -28,7 +28,7 @@ from romandask.runtime.schemas import schema
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
-from romandask.runtime.work import Task
+from romandask.runtime.work import Batch, Task
 
 REGION = Region(51.0, 56.0, -42.0, -38.0)
 COUNTS = {"roman": 12_648_328, "rubin": 6_991_231}
@@ -112,7 +112,7 @@ def whole_survey() -> None:
         def run(product: TableProduct) -> tuple[float, int, int]:
             start, rows, peak = time.perf_counter(), 0, 0
             tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-            for outcome in execution.run(product, tasks, store):
+            for outcome in execution.run(Batch(product, tasks, store)):
                 assert outcome.record is not None, outcome.failure
                 rows, peak = rows + outcome.record.rows, max(peak, outcome.record.peak_bytes)
             return time.perf_counter() - start, rows, peak

@@ -22,6 +22,7 @@ from romandask.runtime.pending import pending
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Made
+from romandask.runtime.work import Batch
 from romandask.stages import plan, stages
 from romandask.survey import Survey
 
@@ -62,7 +63,7 @@ def main(overrides: list[str]) -> None:
             made = product
             if not stage.name.startswith("pointings/"):
                 made = Nothing(product, product.stage, product.names, product.seconds_per_unit, product.bytes_per_unit)
-            outcomes = list(execution.run(made, todo.tasks, store))
+            outcomes = list(execution.run(Batch(made, todo.tasks, store)))
             ran = time.perf_counter() - start
             failed = [outcome.failure for outcome in outcomes if outcome.record is None]
             assert not failed, failed[0]

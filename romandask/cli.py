@@ -21,13 +21,14 @@ from rich.table import Column, Table  # noqa: E402
 
 from romandask import checksums, flow, stages, verification  # noqa: E402
 from romandask.arguments import Overrides, Scheduler, Source, StoreArgument, StoreOption, Workers, resumable  # noqa: E402
+from romandask.dag import dag_svg  # noqa: E402
 from romandask.export_commands import calibration_app, export_app  # noqa: E402
 from romandask.ingest_commands import ingest_app  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline  # noqa: E402
 from romandask.pixfrac import advice, coverage  # noqa: E402
 from romandask.reference import reference as data_products  # noqa: E402
-from romandask.report import dag_svg, write_report  # noqa: E402
+from romandask.report import write_report  # noqa: E402
 from romandask.runtime.cluster import runner  # noqa: E402
 from romandask.runtime.lock import in_use  # noqa: E402
 from romandask.runtime.progress import Reporter, busy, duration  # noqa: E402
@@ -55,8 +56,9 @@ def plan(
 ) -> None:
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
+    survey = Survey(settings)
     with busy("planning"):
-        rows = stages.plan(Survey(settings))
+        rows = stages.plan(survey)
     table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
@@ -72,7 +74,8 @@ def plan(
     )
     Console().print(table)
     if dag is not None:
-        dag_svg(rows, dag)
+        with busy("drawing the stages"):
+            dag_svg(survey, rows, dag)
         Console().print(f"wrote {dag}", highlight=False)
 
 

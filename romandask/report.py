@@ -1,14 +1,12 @@
-"""The report: one HTML page without external assets, and the picture of the stages."""
+"""The report: one HTML page without external assets."""
 
 from __future__ import annotations
 
 import html
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from romandask import pictures
 from romandask.effects import differences
@@ -20,7 +18,6 @@ from romandask.page import image_of, table_of
 from romandask.places import Place, bytes_below, write_bytes
 from romandask.pointings import corners_of
 from romandask.readout import before
-from romandask.stages import Planned
 from romandask.survey import Survey
 from romandask.tile_maker import unit_of
 from romandask.truth_match import reference_band
@@ -74,33 +71,6 @@ def write_report(survey: Survey) -> Place:
     path = survey.store.report / "index.html"
     write_bytes(path, (page + "".join(sections) + "</html>\n").encode())
     return path
-
-
-def dag_svg(rows: list[Planned], path: Path) -> None:
-    """Write the stages of a plan as an SVG picture: a box a stage, its units and bytes, in the order they run."""
-    groups: dict[str, list[Planned]] = {}
-    for row in rows:
-        groups.setdefault(row.stage.split("/")[0], []).append(row)
-    figure = Figure(figsize=(2.6 * len(groups), 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    centres = []
-    for column, (kind, members) in enumerate(groups.items()):
-        lines = [kind] + [f"{row.stage.split('/')[1]}: {row.units}" for row in members]
-        axes.text(
-            column,
-            0,
-            "\n".join(lines),
-            ha="center",
-            va="center",
-            bbox={"boxstyle": "round", "fc": "#e8eef6", "ec": "#45607f"},
-        )
-        centres.append(column)
-    for left in centres[:-1]:
-        axes.annotate("", (left + 0.68, 0), (left + 0.36, 0), arrowprops={"arrowstyle": "->"})
-    axes.set_xlim(-0.5, len(groups) - 0.5)
-    axes.set_ylim(-1, 1)
-    axes.set_axis_off()
-    figure.savefig(path, format="svg")
 
 
 def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 from romandask.course import Run, make
+from romandask.dag import _reduced, kinds_read
 from romandask.pipeline import load_pipeline
 from romandask.runtime.cluster import InProcess, runner
 from romandask.runtime.log import Log, events
@@ -176,3 +177,14 @@ def test_no_product_is_made_from_what_does_not_come_before_it():
         for stage in stages(survey):
             assert reads(stage.product(survey)) - {stage.name} <= before, stage.name
             before.add(stage.name)
+
+
+def test_the_picture_of_the_stages_is_what_they_read():
+    arrows = _reduced(kinds_read(Survey(load_pipeline("tiny"))))
+    assert arrows["exposures"] == {"truth", "pointings"}
+    assert arrows["coadds"] == {"exposures"}, "what exposures read need not be drawn again"
+    assert arrows["differences"] == arrows["truth_match"] == {"detections"}
+    assert arrows["truth_index"] == {"truth", "pointings"}
+    assert arrows["statistics"] == {"matches", "chance"}
+    assert not arrows["truth"]
+    assert not arrows["pointings"]

@@ -33,7 +33,7 @@ LAYERS = [
     {"joint_report"},
     {"joint_pictures"},
     {"pictures", "flow", "page"},
-    {"course"},
+    {"course", "dag"},
     {"stages"},
     {"survey"},
     {"survey_products"},

@@ -104,7 +104,7 @@ def run(
     only: Annotated[
         list[str] | None, typer.Option("--only", help="A stage alone, coadds or coadds/roman; may be repeated.")
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", help="This stage and those after it.")] = None,
+    start: Annotated[str | None, typer.Option("--from", help="This stage and those after it in the plan.")] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say which units would be made and why, and make none.")
     ] = False,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from romandask.runtime.progress import Board, Meter, Reporter
 from romandask.runtime.sealed import catalog_files, image_files, seal, sealed, unseal
 from romandask.runtime.store import Store, refuse_full
 from romandask.runtime.work import Batch, Outcome, Task
-from romandask.stages import Product, Stage, opening, reads
+from romandask.stages import Product, Stage, reads, tier
 from romandask.survey import Survey
 from romandask.truth import write_spectra
 
@@ -79,7 +78,6 @@ class _Going:
     tasks: dict[int, Task]
     """What there is to make, by the number of the unit; those that have ended are taken out."""
     meter: Meter
-    made: int = 0
 
 
 class _Course:
@@ -99,24 +97,28 @@ class _Course:
         return [*self._going, *self._coming]
 
     def ready(self) -> list[Batch]:
-        """Begin every stage that can, and return what there is to make of them; where that is nothing, end them."""
-        batches = []
-        while self._changed and (stage := self._next()):
+        """Begin a stage that can, and return what there is to make of it; where that is nothing, end it and go on.
+
+        One at a time, so that there is work to do while what there is of the next is found.
+        """
+        while self._changed:
+            stage = self._next()
+            if stage is None:
+                self._changed = False
+                break
             del self._coming[stage.name]
             if going := self._begin(stage):
-                tasks = [*going.tasks.values()]
-                batches.append(Batch(going.product, tasks, self._this.store, self._ranks[stage.name]))
-        self._changed = False
-        return batches
+                return [Batch(going.product, [*going.tasks.values()], self._this.store, self._ranks[stage.name])]
+        return []
 
     def take(self, outcome: Outcome) -> None:
         """Log what became of a unit, and end its stage with the last; one that failed is set aside with the reason."""
         this, stage = self._this, outcome.stage
         going, record = self._going[stage], outcome.record
         task, unit = going.tasks.pop(outcome.index), going.product.names[outcome.index]
-        going.meter.advance(task.cost, math.inf if record is None else record.seconds)
+        going.meter.advance(task.cost, 0.0 if record is None else record.seconds)
         if record is not None:
-            going.made += 1
+            this.summary.made[stage] += 1
             figures = {"seconds": record.seconds, "bytes": record.bytes, "rows": record.rows}
             this.log.write(
                 "unit", stage=stage, unit=unit, why=task.why, **figures,
@@ -131,14 +133,13 @@ class _Course:
         if not going.tasks:
             del self._going[stage]
             self._changed = True
-            self._end(going.stage, going.product, going.made)
+            self._end(going.stage, going.product)
 
     def _next(self) -> Stage | None:
         """Return a stage that can begin."""
         open_ = {*self._coming, *self._going}
-        # what truth and pointings there are tells what units others have
-        first = any(opening(name) for name in open_)
-        candidates = [stage for stage in self._coming.values() if opening(stage.name) or not first]
+        now = min(map(tier, open_), default=0)
+        candidates = [stage for stage in self._coming.values() if tier(stage.name) == now]
         with self._this.reporter.busy("putting the stages in order"):
             return next((stage for stage in candidates if not self._read_by(stage) & open_), None)
 
@@ -156,7 +157,7 @@ class _Course:
         self._tell(stage.name, todo)
         drop_strays(product, this.store, {product.names[task.index] for task in todo.tasks})
         if not todo.tasks:
-            self._end(stage, product, 0)
+            self._end(stage, product)
             return None
         unseal(this.store, stage.name)
         product.prepare(this.store)
@@ -172,21 +173,21 @@ class _Course:
 
     def _tell(self, stage: str, todo: Pending) -> None:
         summary = self._this.summary
-        summary.kept[stage] = todo.kept
+        summary.made[stage], summary.kept[stage] = 0, todo.kept
         summary.failed += [f"{stage}/{name} (an input is missing)" for name in todo.blocked]
         summary.failed += [f"{stage}/{name} (set aside, it failed before)" for name in todo.aside]
 
-    def _end(self, stage: Stage, product: Product, made: int) -> None:
+    def _end(self, stage: Stage, product: Product) -> None:
         """Write what a stage has but its units: the files of a catalog, spectra, checksums."""
         store = self._this.store
-        self._this.summary.made[stage.name] = made
-        if stage.position is not None and (made or not (store.catalog(product.stage) / "hats.properties").exists()):
-            write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
-        if made or not sealed(store, stage.name):
-            if isinstance(product, ImageProduct):
-                seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
-            elif stage.position is not None:
+        # what an earlier run left unsealed it did not end
+        anew = self._this.summary.made[stage.name] or not sealed(store, stage.name)
+        if anew or (stage.position is not None and not (store.catalog(stage.name) / "hats.properties").exists()):
+            if stage.position is not None:
+                write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
                 seal(store, stage.name, catalog_files(store, stage.name))
+            elif isinstance(product, ImageProduct):
+                seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
         if stage.name == "truth/galaxies":
             write_spectra(self._this.survey.truth_catalogs, store)
             seal(store, "truth/seds", files_below(store.images("truth/seds")))

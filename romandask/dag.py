@@ -8,7 +8,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from romandask.stages import Planned, opening, reads, stages
+from romandask.stages import Planned, reads, stages, tier
 from romandask.survey import Survey
 
 
@@ -49,8 +49,9 @@ def kinds_read(survey: Survey) -> dict[str, set[str]]:
     for stage in stages(survey):
         kind, part = stage.name.split("/")
         sources = reads(stage.product(survey))
-        # of what truth alone goes into, and exposures with it, the units are those of the pointings
-        if sources and all(map(opening, sources)) and not opening(stage.name):
+        # the units of what is made from truth alone, and the SCAs of which there are calibrations, are in the pointings
+        drawn = sources and all(source.startswith(("truth/", "calibration/")) for source in sources)
+        if kind == "calibration" or (drawn and tier(stage.name) == 2):
             sources |= {f"pointings/{part}"}
         found.setdefault(kind, set()).update(source.split("/")[0] for source in sources)
         found[kind].discard(kind)

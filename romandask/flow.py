@@ -1,4 +1,4 @@
-"""The stages in order: what each needs a unit, the plan, the run and the status of a store."""
+"""A run of the stages, what it would do, and the status of a store."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from romandask.runtime.pending import failed, pending
 from romandask.runtime.progress import Reporter
 from romandask.runtime.sealed import seal
 from romandask.runtime.store import Store, write_json
-from romandask.stages import Chosen, opening, plan, stages
+from romandask.stages import Chosen, plan, stages, tier
 from romandask.survey import Survey
 
 PACKAGES = (
@@ -65,7 +65,7 @@ def run(
     chosen: Chosen | None = None,
     retry: bool = False,
 ) -> Summary:
-    """Make and store, in order, what is missing or no longer what the pipeline asks for.
+    """Make and store what is missing or no longer what the pipeline asks for.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def status(survey: Survey) -> list[tuple[str, int, int, int]]:
     for stage in stages(survey):
         aside = len(failed(store, stage.name))
         done = len(store.recorded(stage.name))
-        if opening(stage.name) or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
+        if tier(stage.name) < 2 or all(read_record(store, f"pointings/{name}", "all") for name in survey.instruments):
             units = len(stage.product(survey).units)
         else:
             units = -1

@@ -1,4 +1,4 @@
-"""The stages of a survey in the order in which they run, and the plan: what each needs a unit."""
+"""The stages of a survey, each after those that it is made from, and the plan: what each needs a unit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Chosen:
     only: tuple[str, ...] = ()
     """Names (coadds/roman) or kinds (coadds) of stages; none for all."""
     start: str | None = None
-    """The first of them."""
+    """The first of them, in the order of the plan."""
 
     def of(self, every: list[Stage]) -> list[Stage]:
         """Return the chosen ones, in order.
@@ -53,9 +53,14 @@ class Chosen:
         return [stage for stage in every[first:] if not self.only or any(_is(stage, name) for name in self.only)]
 
 
-def opening(stage: str) -> bool:
-    """True of stages that must be there before the units of those after them are known."""
-    return stage.startswith(("truth/", "pointings/"))
+def tier(stage: str) -> int:
+    """Return the tier of a stage: none is put together before those of an earlier one have ended.
+
+    What they leave tells which units it has: source rows those of truth; truth and pointings those of all others.
+    """
+    if stage == "truth/incoming":
+        return 0
+    return 1 if stage.startswith(("truth/", "pointings/")) else 2
 
 
 def reads(product: Product) -> frozenset[str]:
@@ -98,7 +103,7 @@ _SETTING = {
 
 
 def stages(survey: Survey) -> list[Stage]:
-    """Return the stages of a survey in the order in which they run."""
+    """Return the stages of a survey, each after those that it is made from; the earlier one's units go first."""
     names = list(survey.instruments)
     found = [_first(survey)]
     found += _with_margin("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec"))

@@ -2,7 +2,7 @@
 
 import io
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,20 +10,25 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from conftest import MINI
 from rich.console import Console
 
+from romandask import flow
 from romandask.course import Run, make
 from romandask.dag import _reduced, kinds_read
+from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
 from romandask.runtime.cluster import InProcess, runner
+from romandask.runtime.images import ImageProduct
 from romandask.runtime.log import Log, events
 from romandask.runtime.progress import Reporter
+from romandask.runtime.sealed import unseal
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Unit
 from romandask.runtime.waves import WAVE, Wave, hand_out
 from romandask.runtime.work import Batch, Task
-from romandask.stages import Stage, opening, reads, stages
+from romandask.stages import Stage, reads, stages, tier
 from romandask.survey import Survey
 
 SCHEMA = pa.schema([("number", pa.int64())])
@@ -110,7 +115,7 @@ def test_units_are_not_known_before_truth_and_pointings_are_there(tmp_path):
     course(found, tmp_path)
     assert asked
     assert all(names == ["u0", "u0"] for names in asked), asked
-    assert [opening(stage.name) for stage in found] == [True, True, False]
+    assert [tier(stage.name) for stage in found] == [1, 1, 2]
 
 
 def test_what_fails_holds_up_only_what_needs_it(tmp_path):
@@ -169,6 +174,82 @@ def test_of_a_later_stage_nothing_is_handed_out_while_an_earlier_one_has_units_t
     assert [name for name, *_ in client.sent[3:]] == ["truth_index"] * (WAVE * 2 - 2)
 
 
+def test_units_that_wait_for_others_of_their_stage_do_not_keep_those_of_a_later_one_from_free_workers(tmp_path):
+    """Twenty exposures of one detector, each after the one before it: the other worker has the index."""
+    client, threads = Client(), {"one": 1, "two": 1}
+    first, second = (
+        TableProduct(name, tuple(Unit(f"u{k}", k) for k in range(20)), Waits(), SCHEMA, seconds_per_unit=seconds)
+        for name, seconds in (("exposures/x", 60.0), ("truth_index/x", 1.0))
+    )
+    chain = [Task(k, "inputs", 20.0 - k, "", (k - 1,) if k else ()) for k in range(20)]
+    alone = [Task(k, "inputs", 1.0) for k in range(20)]
+    waves = [
+        Wave(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
+        for rank, (product, tasks) in enumerate([(first, chain), (second, alone)])
+    ]
+    hand_out(waves, threads)
+    sent = [name for name, *_ in client.sent]
+    assert sent == ["exposures"] * (1 + WAVE * 2) + ["truth_index"] * (WAVE * 2 - 1)
+
+
+def test_nothing_goes_on_when_the_store_can_take_no_more(tmp_path, monkeypatch):
+    def full(error, store):
+        raise UserError(f"{store.root}: no space left")
+
+    monkeypatch.setattr("romandask.course.refuse_full", full)
+    found = [stage_of("coadds/x", 1, Waits(bad=(0,))), stage_of("truth_index/x", 40, Waits(wanted=tmp_path / "never"))]
+    with runner(1, 1.5) as execution:
+        with pytest.raises(UserError, match="no space left"):
+            course(found, tmp_path, execution)
+        deadline = time.monotonic() + 30
+        while execution._client.futures and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert not execution._client.futures, "what was handed out is taken back"
+        (tmp_path / "never").touch()
+
+
+def test_what_a_run_was_stopped_before_it_could_seal_is_written_again(tmp_path, monkeypatch):
+    """All units of a catalog were made anew, but its files are still those of the run before."""
+    written = []
+    monkeypatch.setattr("romandask.course.write_catalog_files", lambda product, *_: written.append(product.stage))
+    monkeypatch.setattr("romandask.course.catalog_files", lambda *_: [])
+    (one,) = [replace(stage_of("objects/x", 1, Waits()), position=("ra", "dec"))]
+    course([one], tmp_path)
+    assert written == ["objects/x"]
+    store = Store(tmp_path / "store")
+    (store.catalog("objects/x")).mkdir(parents=True, exist_ok=True)
+    (store.catalog("objects/x") / "hats.properties").touch()
+    course([one], tmp_path)
+    assert written == ["objects/x"], "nothing was made, nothing is written"
+    unseal(store, "objects/x")
+    course([one], tmp_path)
+    assert written == ["objects/x"] * 2
+
+
+def test_what_units_read_is_there_when_they_are_made(tmp_path, monkeypatch):
+    """A stage that began too early would make what it reads by itself: slowly, and in memory that nobody planned."""
+    pipeline = load_pipeline("tiny", [*MINI, "roman.detector=sca"])
+    known = {stage.name for stage in stages(Survey(pipeline))}
+
+    def checked(kind, name):
+        method = getattr(kind, name)
+
+        def call(product, index, *arguments, **others):
+            there = product.store is None or product.stage not in known or product.has(index)
+            assert there, f"{product.stage}/{product.names[index]} is read and is not there"
+            return method(product, index, *arguments, **others)
+
+        monkeypatch.setattr(kind, name, call)
+
+    for kind, name in ((TableProduct, "load"), (TableProduct, "select"), (ImageProduct, "load")):
+        checked(kind, name)
+    store = Store(tmp_path / "store")
+    store.prepare()
+    summary = flow.run(pipeline, store, InProcess(), Reporter(Console(file=io.StringIO())))
+    assert not summary.failed
+    assert set(summary.made) == known
+
+
 def test_no_product_is_made_from_what_does_not_come_before_it():
     """The order of the stages is one in which they can run, whatever a survey has."""
     for name in ("tiny", "one_tile", "joint_tile"):
@@ -188,3 +269,7 @@ def test_the_picture_of_the_stages_is_what_they_read():
     assert arrows["statistics"] == {"matches", "chance"}
     assert not arrows["truth"]
     assert not arrows["pointings"]
+    arrows = _reduced(kinds_read(Survey(load_pipeline("tiny", ["roman.detector=sca"]))))
+    assert arrows["exposures"] == {"truth", "calibration"}
+    assert arrows["calibration"] == {"pointings"}
+    assert arrows["coadds"] == {"exposures"}

@@ -81,6 +81,17 @@ def test_values_that_are_not_finite_are_never_written(tmp_path):
         bad.write(0, store)
 
 
+def test_what_a_maker_keeps_stays_its_own(tmp_path):
+    """Written to two stores by one process, the matter of a universe for example, which is made once."""
+    kept = {"image": np.ones((64, 48), np.float32)}
+    product = ImageProduct(**{**vars(images(1)), "make": lambda k: kept})
+    for name in ("one", "two"):
+        store = Store(tmp_path / name)
+        product.prepare(store)
+        product.write(0, store)
+        assert list(kept) == ["image"]
+
+
 @pytest.mark.parametrize("position", [0.2, 0.5, 0.8])
 def test_a_flipped_byte_of_an_image_is_found_when_read(tmp_path, position):
     store = Store(tmp_path)

@@ -17,6 +17,7 @@ from hats.io.validation import is_valid_catalog, is_valid_collection
 from hats.loaders import read_hats
 from rich.console import Console
 
+from romandask import incoming
 from romandask.export import export_truth
 from romandask.flow import ingest
 from romandask.instruments.rubin import Rubin, RubinSettings
@@ -185,6 +186,19 @@ def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
     for band in "ri":
         ratio = 2.5 * np.log10(both[f"flux_{band}"] / both[f"lsst_flux_{band}"])
         assert (ratio - ratio.median()).std() < 0.12
+
+
+def test_a_source_is_read_once(tmp_path, shared, monkeypatch):
+    """What truth there is its rows tell, those in the store: not a second pass over the files."""
+    read, batch = [], incoming._ReadBatch.__call__
+
+    def counted(maker, index):
+        read.append(index)
+        return batch(maker, index)
+
+    monkeypatch.setattr(incoming._ReadBatch, "__call__", counted)
+    _, survey = ingested(tmp_path, shared, {"source": "skycatalogs", "path": "skycatalogs_sample"})
+    assert sorted(read) == list(range(len(survey.incoming_product.units)))
 
 
 def ingested(tmp_path, shared, settings, seds="seds"):

@@ -52,7 +52,8 @@ class Runner(Protocol):
         Parameters
         ----------
         begin : what is to be made
-        more : asked at the beginning, and when what was yielded has been taken, for what can be made now
+        more : asked at the beginning, and when what was yielded has been taken, for what can be made now; again until
+            there is nothing
         """
 
     def recording(self, path: Place) -> AbstractContextManager[Any]:
@@ -70,11 +71,14 @@ class InProcess:
 
     def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
         """Yield what became of each unit, a stage after the other; a failure is not tried again."""
-        batches = [*begin, *more()]
-        while batches:
+        batches = [*begin]
+        while True:
+            while new := [*more()]:
+                batches += new
+            if not batches:
+                return
             batches.sort(key=lambda batch: batch.rank)
             yield from _one_by_one(batches.pop(0))
-            batches += more()
 
 
 def _one_by_one(batch: Batch) -> Iterator[Outcome]:
@@ -101,18 +105,36 @@ class OnCluster:
         return _recording(self._client, path)
 
     def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
-        """Yield what became of each unit; one that fails is tried up to three times."""
+        """Yield what became of each unit; one that fails is tried up to three times.
+
+        Raises
+        ------
+        UserError
+            If for a minute there is no worker.
+        """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         waves = [Wave(self._client, batch, ended.put) for batch in begin]
+        seen = time.monotonic()
         try:
             while True:
-                waves += [Wave(self._client, batch, ended.put) for batch in more()]
-                waves = sorted(filter(None, waves), key=lambda wave: wave.batch.rank)
+                # as long as there are more they are asked for, but workers have something to do in the meantime
+                new = [Wave(self._client, batch, ended.put) for batch in more()]
+                waves = sorted(filter(None, [*waves, *new]), key=lambda wave: wave.batch.rank)
+                threads = self._threads()
+                seen = time.monotonic() if threads else seen
+                hand_out(waves, threads)
+                if new:
+                    continue
                 if not waves:
                     return
-                hand_out(waves, self._threads())
                 future = self._next(ended)
-                yield from next(wave for wave in waves if future in wave.flown).settle(future)
+                if future is not None:
+                    yield from next(wave for wave in waves if future in wave.flown).settle(future)
+                elif time.monotonic() - seen > PATIENCE:
+                    raise UserError(
+                        f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
+                        "(memory: raise run.memory_limit); the same command resumes"
+                    )
         finally:
             left = [future for wave in waves for future in wave.flown]
             if left:
@@ -122,23 +144,13 @@ class OnCluster:
         workers = self._client.scheduler_info(n_workers=-1)["workers"]
         return {address: worker["nthreads"] for address, worker in workers.items()}
 
-    def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
-        """Return the next task that ends; UserError where no worker is left for a minute to end one."""
-        alone_since: float | None = None
-        while True:
-            try:
-                return ended.get(timeout=2.0)
-            except queue.Empty:
-                self._restart()
-                if self._threads():
-                    alone_since = None
-                    continue
-                alone_since = alone_since or time.monotonic()
-                if time.monotonic() - alone_since > PATIENCE:
-                    raise UserError(
-                        f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
-                        "(memory: raise run.memory_limit); the same command resumes"
-                    ) from None
+    def _next(self, ended: queue.SimpleQueue[Any]) -> Any | None:
+        """Return the next task that ends; None after two seconds, for there may be workers that have nothing yet."""
+        try:
+            return ended.get(timeout=2.0)
+        except queue.Empty:
+            self._restart()
+            return None
 
 
 @contextmanager

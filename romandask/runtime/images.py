@@ -136,7 +136,8 @@ class ImageProduct:
         """Make one unit and write it; no other unit shares its shards."""
         if self.stream is not None:
             return self._written(self.stream(index), index, store)
-        arrays = self.make(index)
+        # what is made may be what the maker keeps
+        arrays = dict(self.make(index))
         tables = {
             name: write_parquet(
                 table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name)

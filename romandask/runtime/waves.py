@@ -111,27 +111,31 @@ class Wave:
 
 
 def hand_out(waves: Sequence[Wave], threads: dict[str, int]) -> None:
-    """Hand out as much as workers should hold: of a wave nothing while one before it has units that wait.
+    """Hand out as much as workers should hold: of a wave nothing while one before it has units that could begin.
 
     Parameters
     ----------
     threads : of each worker, by address
     """
     total = max(1, sum(threads.values()))
-    flown = [(wave, one) for wave in waves for one in wave.flown.values()]
-    room = WAVE * total - len(flown)
-    free = total - sum(wave.long and not wave.held(one.task) for wave, one in flown)
-    places = Counter(one.place for _, one in flown if one.place)
+    # those that wait for others in flight keep nobody busy
+    able = [(wave, one) for wave in waves for one in wave.flown.values() if not wave.held(one.task)]
+    room = WAVE * total - len(able)
+    free = total - sum(wave.long for wave, _ in able)
+    places = Counter(one.place for wave in waves for one in wave.flown.values() if one.place)
     for wave in waves:
-        while wave.waiting:
+        held = sum(wave.held(one.task) for one in wave.flown.values())
+        while wave.waiting and held < WAVE * total:
             if room <= 0 or (wave.long and free <= 0):
                 return
             place = min(threads, key=lambda one: places[one] / max(1, threads[one]), default=None)
             sent = wave.submit(place if wave.long else None)
-            room -= 1
-            free -= wave.long and not wave.held(sent.task)
             if sent.place:
                 places[sent.place] += 1
+            if wave.held(sent.task):
+                held += 1
+            else:
+                room, free = room - 1, free - wave.long
 
 
 def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:

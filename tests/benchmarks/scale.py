@@ -10,20 +10,25 @@ import resource
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cloudpickle
+from rich.console import Console
 
+from romandask import course, flow
 from romandask.pipeline import load_pipeline
-from romandask.runtime.cluster import runner
+from romandask.places import Place
+from romandask.runtime.cluster import Runner, runner
 from romandask.runtime.images import ImageProduct
-from romandask.runtime.pending import pending
+from romandask.runtime.progress import Reporter
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 from romandask.runtime.units import Made
-from romandask.runtime.work import Batch
-from romandask.stages import plan, stages
+from romandask.runtime.work import Batch, Outcome
+from romandask.stages import plan
 from romandask.survey import Survey
 
 WORKERS = 2
@@ -43,43 +48,52 @@ class Nothing:
         return Made(self.names[index], 0, 0)
 
 
+class Idle:
+    """Runs units as a cluster does; of what is handed to it nothing is made, but for the pointings."""
+
+    def __init__(self, runner: Runner):
+        self._runner, self.description = runner, runner.description
+        self.largest = 0
+        """Size of the largest product that was sent to the workers, bytes."""
+
+    def recording(self, path: Place) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def run(self, *begin: Batch, more: Callable[[], Iterable[Batch]]) -> Iterator[Outcome]:
+        yield from self._runner.run(*map(self._emptied, begin), more=lambda: map(self._emptied, more()))
+
+    def _emptied(self, batch: Batch) -> Batch:
+        product = batch.product
+        self.largest = max(self.largest, len(cloudpickle.dumps(product)))
+        if product.stage.startswith("pointings/"):
+            return batch
+        nothing = Nothing(product, product.stage, product.names, product.seconds_per_unit, product.bytes_per_unit)
+        return replace(batch, product=nothing)
+
+
 def main(overrides: list[str]) -> None:
     settings = load_pipeline("troxel2023", overrides)
     start = time.perf_counter()
-    planned = {row.stage: row.hours for row in plan(Survey(settings))}
+    planned = plan(Survey(settings))
     print(f"plan: {time.perf_counter() - start:.0f} s")
-    total, count = 0.0, 0
-    print(f"{'stage':24s} {'units':>8s} {'found in':>9s} {'run in':>8s} {'a task':>9s} {'product':>9s}")
+    # of what has no files neither a catalog nor spectra can be written
+    course.write_catalog_files = course.write_spectra = lambda *_: None
+    course.catalog_files = course.files_below = lambda *_: []
     with tempfile.TemporaryDirectory() as name, runner(WORKERS, settings.run.memory_limit) as execution:
-        store = Store(Path(name))
-        survey = Survey(settings, store)
-        for stage in stages(survey):
-            start = time.perf_counter()
-            product = stage.product(survey)
-            todo = pending(product, store)
-            assert not todo.blocked, todo.blocked[:3]
-            found = time.perf_counter() - start
-            start = time.perf_counter()
-            made = product
-            if not stage.name.startswith("pointings/"):
-                made = Nothing(product, product.stage, product.names, product.seconds_per_unit, product.bytes_per_unit)
-            outcomes = list(execution.run(Batch(made, todo.tasks, store)))
-            ran = time.perf_counter() - start
-            failed = [outcome.failure for outcome in outcomes if outcome.record is None]
-            assert not failed, failed[0]
-            total, count = total + found + ran, count + len(outcomes)
-            size = len(cloudpickle.dumps(product)) / 1e6
-            each = 1000 * ran / max(1, len(outcomes))
-            print(
-                f"{stage.name:24s} {len(outcomes):8d} {found:7.1f} s {ran:6.1f} s {each:6.1f} ms {size:6.1f} MB",
-                flush=True,
-            )
-    hours = sum(planned.values())
+        store, idle = Store(Path(name)), Idle(execution)
+        store.prepare()
+        start = time.perf_counter()
+        summary = flow.run(settings, store, idle, Reporter(Console()))
+        total = time.perf_counter() - start
+    assert not summary.failed, summary.failed[:3]
+    hours, count = sum(row.hours for row in planned), sum(summary.made.values())
+    assert count == sum(row.units for row in planned)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     share = total / 3600 / (hours / WORKERS)
     print(
         f"{count} units in {total / 60:.1f} min, {1000 * total / count:.1f} ms each; the work {hours:.0f} core hours "
-        f"by the plan, overhead {share:.2%} on {WORKERS} workers; scheduler and driver {peak:.2f} GiB"
+        f"by the plan, overhead {share:.2%} on {WORKERS} workers; scheduler and driver {peak:.2f} GiB, "
+        f"largest product {idle.largest / 1e6:.1f} MB"
     )
 
 

@@ -56,8 +56,8 @@ def plan(
 ) -> None:
     """Show units, bytes and peak memory of every stage; write nothing."""
     settings = load_pipeline(pipeline, overrides)
-    survey = Survey(settings)
     with busy("planning"):
+        survey = Survey(settings)
         rows = stages.plan(survey)
     table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:

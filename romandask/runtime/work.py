@@ -12,6 +12,9 @@ from romandask.runtime.memory import INTERPRETER, begin_peak, give_back, peak
 from romandask.runtime.store import Store
 from romandask.runtime.tables import TableProduct
 
+LARGE = 512 << 20
+"""Bytes: before a unit that takes more, free memory goes back to the system, whatever was made before it."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -69,7 +72,11 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
 
     `after` are records of units that it had to wait for: of a task graph's edges the values.
     """
-    start, held = time.perf_counter(), begin_peak()
+    start = time.perf_counter()
+    if product.bytes_per_unit > LARGE:
+        # what lies free in the heap would be beside what this unit takes
+        give_back()
+    held = begin_peak()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         made = product.write(task.index, store)
@@ -90,7 +97,4 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
         warnings=sorted(told),
     )
     write_record(store, record)
-    if record.seconds > 1:
-        # what lies free in the heap would be beside what the next unit takes
-        give_back()
     return record

@@ -117,17 +117,15 @@ class OnCluster:
         seen = time.monotonic()
         try:
             while True:
-                # as long as there are more they are asked for, but workers have something to do in the meantime
+                # as long as there are more they are asked for; in between workers get what they can do
                 new = [Wave(self._client, batch, ended.put) for batch in more()]
                 waves = sorted(filter(None, [*waves, *new]), key=lambda wave: wave.batch.rank)
                 threads = self._threads()
                 seen = time.monotonic() if threads else seen
                 hand_out(waves, threads)
-                if new:
-                    continue
-                if not waves:
+                if not waves and not new:
                     return
-                future = self._next(ended)
+                future = self._next(ended, 0.0 if new else 2.0)
                 if future is not None:
                     yield from next(wave for wave in waves if future in wave.flown).settle(future)
                 elif time.monotonic() - seen > PATIENCE:
@@ -144,10 +142,10 @@ class OnCluster:
         workers = self._client.scheduler_info(n_workers=-1)["workers"]
         return {address: worker["nthreads"] for address, worker in workers.items()}
 
-    def _next(self, ended: queue.SimpleQueue[Any]) -> Any | None:
-        """Return the next task that ends; None after two seconds, for there may be workers that have nothing yet."""
+    def _next(self, ended: queue.SimpleQueue[Any], patience: float) -> Any | None:
+        """Return the next task that ends; None after some seconds, for there may be workers that have nothing yet."""
         try:
-            return ended.get(timeout=2.0)
+            return ended.get(timeout=patience)
         except queue.Empty:
             self._restart()
             return None

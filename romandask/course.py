@@ -183,11 +183,11 @@ class _Course:
         # what an earlier run left unsealed it did not end
         anew = self._this.summary.made[stage.name] or not sealed(store, stage.name)
         if anew or (stage.position is not None and not (store.catalog(stage.name) / "hats.properties").exists()):
-            if stage.position is not None:
-                write_catalog_files(product, store, *stage.position)  # type: ignore[arg-type]
-                seal(store, stage.name, catalog_files(store, stage.name))
-            elif isinstance(product, ImageProduct):
+            if isinstance(product, ImageProduct):
                 seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
+            elif stage.position is not None:
+                write_catalog_files(product, store, *stage.position)
+                seal(store, stage.name, catalog_files(store, stage.name))
         if stage.name == "truth/galaxies":
             write_spectra(self._this.survey.truth_catalogs, store)
             seal(store, "truth/seds", files_below(store.images("truth/seds")))

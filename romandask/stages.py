@@ -54,9 +54,10 @@ class Chosen:
 
 
 def tier(stage: str) -> int:
-    """Return the tier of a stage: none is put together before those of an earlier one have ended.
+    """Return the tier of a stage, 0 to 2: none is put together before those of an earlier one have ended.
 
-    What they leave tells which units it has: source rows those of truth; truth and pointings those of all others.
+    What they leave tells which units it has: source rows (0) those of truth and pointings (1), these those of all
+    others (2).
     """
     if stage == "truth/incoming":
         return 0

@@ -11,7 +11,7 @@ import re
 import socket
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from importlib.metadata import version
@@ -46,7 +46,7 @@ class Runner(Protocol):
 
     description: str
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
+    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
         """Yield what became of each unit, as they end.
 
         Parameters
@@ -69,7 +69,7 @@ class InProcess:
         """Write nothing: there is no cluster."""
         return nullcontext()
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
+    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
         """Yield what became of each unit, a stage after the other; a failure is not tried again."""
         batches = [*begin]
         while True:
@@ -104,7 +104,7 @@ class OnCluster:
         """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
         return _recording(self._client, path)
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Iterator[Outcome]:
+    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
         """Yield what became of each unit; one that fails is tried up to three times.
 
         Raises

@@ -10,7 +10,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,7 +59,7 @@ class Idle:
     def recording(self, path: Place) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def run(self, *begin: Batch, more: Callable[[], Iterable[Batch]]) -> Iterator[Outcome]:
+    def run(self, *begin: Batch, more: Callable[[], Iterable[Batch]]) -> Generator[Outcome, None, None]:
         yield from self._runner.run(*map(self._emptied, begin), more=lambda: map(self._emptied, more()))
 
     def _emptied(self, batch: Batch) -> Batch:

@@ -4,22 +4,22 @@ from importlib.metadata import version as _version
 
 from threadpoolctl import threadpool_limits
 
-from romandask.coadds import coadds
-from romandask.cutouts import cutouts
-from romandask.detections import detections, objects
-from romandask.exposures import exposures
-from romandask.flow import run_on
-from romandask.matches import matches
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.pipeline import Pipeline, load_pipeline
-from romandask.pointings import pointings
-from romandask.psfs import psfs
-from romandask.statistics import statistics
+from romandask.run import run_on
+from romandask.stages.analysis.blend_statistics import statistics
+from romandask.stages.analysis.friends_of_friends import matches
+from romandask.stages.coadds.coadds import coadds
+from romandask.stages.cutouts import cutouts
+from romandask.stages.detections.detections import detections, objects
+from romandask.stages.exposures import exposures
+from romandask.stages.pointings import pointings
+from romandask.stages.psf_images import psfs
+from romandask.stages.truth.catalogs import truth
+from romandask.stages.truth_index import truth_index
 from romandask.survey import Survey
 from romandask.survey import open_survey as open  # noqa: A004
-from romandask.truth import truth
-from romandask.truth_index import truth_index
 
 __version__ = _version("romandask")
 # with more threads linear algebra rounds its sums otherwise, and pixels would depend on how many cores there are

@@ -8,11 +8,13 @@ from typing import Any
 import yaml
 from pydantic import Field, model_validator
 
-from romandask.instruments.exposure import Instrument
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.instruments.roman_calibration import CalibrationSource
-from romandask.instruments.rubin import Rubin, RubinSettings
-from romandask.model.config import (
+from romandask.instruments.instrument import Instrument
+from romandask.instruments.roman.calibration_source import CalibrationSource
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.model.errors import UserError
+from romandask.model.resources import resource_folder
+from romandask.model.settings import (
     CoaddSettings,
     DetectionSettings,
     DifferenceSettings,
@@ -27,9 +29,7 @@ from romandask.model.config import (
     read_yaml,
     validate,
 )
-from romandask.model.errors import UserError
-from romandask.model.resources import resource_folder
-from romandask.places import Place, below, place_of, reached
+from romandask.storage.paths import Place, below, place_of, reached
 
 
 class Pipeline(Section):

@@ -10,22 +10,22 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from romandask.cutouts import Positions, Wanted, cutouts, located
-from romandask.matches import group_of
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.pipeline import load_pipeline
-from romandask.places import Place, place_of, reached
-from romandask.pointings import visits
-from romandask.runtime.manifest import read_records
-from romandask.runtime.store import Store
-from romandask.runtime.tables import TableProduct
-from romandask.star import Spectrum, coadd_psf
-from romandask.statistics import Statistics, matrix
+from romandask.products.tables import TableProduct
+from romandask.stages.analysis.blend_statistics import Statistics, matrix
+from romandask.stages.analysis.friends_of_friends import group_of
+from romandask.stages.analysis.validation import depths, residuals, with_truth
+from romandask.stages.coadds.psf_at import Spectrum, coadd_psf
+from romandask.stages.cutouts import Positions, Wanted, cutouts, located
+from romandask.stages.detections.truth_match import completeness, reference_band
+from romandask.stages.detections.zero_points import FLUXES
+from romandask.stages.pointings import visits
+from romandask.storage.manifest import read_records
+from romandask.storage.paths import Place, place_of, reached
+from romandask.storage.store import Store
 from romandask.survey_products import SurveyProducts
-from romandask.truth_match import completeness, reference_band
-from romandask.validation import depths, residuals, with_truth
-from romandask.zero_points import FLUXES
 
 
 class Survey(SurveyProducts):
@@ -116,10 +116,15 @@ class Survey(SurveyProducts):
         return self.coadd_product(survey).dataset
 
     def psf(
-        self, ra: float, dec: float, band: str, stamp: int | None = None, scale: float | None = None,
+        self,
+        ra: float,
+        dec: float,
+        band: str,
+        stamp: int | None = None,
+        scale: float | None = None,
         spectrum: Spectrum | None = None,
-    ) -> xr.DataArray:  # fmt: skip
-        """Return the image of a unit star (v, u) at a place of Roman's coadds: see `romandask.star.coadd_psf`.
+    ) -> xr.DataArray:
+        """Return the image of a unit star (v, u) at a place of Roman's coadds: see `stages.coadds.psf_at.coadd_psf`.
 
         It is as the coadd has it there, or, with a scale, sampled every so many arcsec with the star in the middle.
         """
@@ -167,7 +172,7 @@ class Survey(SurveyProducts):
         return depths(self.object_product(survey).all_rows(), self.bands(survey))
 
     def residuals(self, survey: str, flux: str = "kronFlux") -> pd.DataFrame:
-        """Return by band and magnitude how measured fluxes differ from the truth: `romandask.validation.residuals`."""
+        """Return bias, scatter and pulls of measured fluxes by band and magnitude (`stages.analysis.validation`)."""
         return residuals(
             self.objects_with_truth(survey), self.bands(survey), self._one({f: f for f in FLUXES}, flux, FLUXES)
         )
@@ -187,8 +192,8 @@ class Survey(SurveyProducts):
     def shear(self, survey: str) -> pd.DataFrame:
         """Return xi+ and xi- of the true shapes of a survey's sample (schema: catalogs/shear.yaml).
 
-        Of a region too small for the shortest separation it has no rows. `romandask.lensing.significance` is the signal
-        to noise of such a table.
+        Of a region too small for the shortest separation it has no rows. `stages.analysis.shear.significance` is the
+        signal to noise of such a table.
         """
         return self.lensing_products(survey).shear.all_rows()
 

@@ -8,35 +8,35 @@ from typing import Any
 
 import pandas as pd
 
-from romandask.calibration import calibrations
-from romandask.coadds import coadds
-from romandask.detections import detections, objects
-from romandask.differences import differences
-from romandask.exposures import exposures
-from romandask.incoming import incoming, open_sources
-from romandask.instruments.exposure import Instrument
-from romandask.lensing import Lensing, lensing
-from romandask.matches import SHIFT, Matches, matches
+from romandask.instruments.instrument import Instrument
+from romandask.instruments.roman.calibration import calibrations
 from romandask.model.errors import UserError
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.model.tiles import Tile
 from romandask.pipeline import Pipeline
-from romandask.places import Place, below, place_of, state_of
-from romandask.pointings import pointings
-from romandask.psfs import psfs
-from romandask.runtime.images import ImageProduct
-from romandask.runtime.manifest import read_record
-from romandask.runtime.schemas import schema
-from romandask.runtime.store import Store, read_parquet
-from romandask.runtime.tables import TableProduct, conform, to_frame
-from romandask.runtime.units import Unit
-from romandask.samples import limits, samples
-from romandask.statistics import SURVEYS, Samples, Statistics, statistics
-from romandask.truth import TruthCatalogs, truth
-from romandask.truth_index import truth_index
-from romandask.truth_match import REFERENCE_BANDS, reference_band, truth_match, truth_summary
-from romandask.zero_points import zero_points
+from romandask.products.images import ImageProduct
+from romandask.products.schemas import schema
+from romandask.products.tables import TableProduct, conform, to_frame
+from romandask.products.units import Unit
+from romandask.stages.analysis.blend_statistics import SURVEYS, Samples, Statistics, statistics
+from romandask.stages.analysis.differences import differences
+from romandask.stages.analysis.friends_of_friends import SHIFT, Matches, matches
+from romandask.stages.analysis.samples import limits, samples
+from romandask.stages.analysis.shear import Lensing, lensing
+from romandask.stages.coadds.coadds import coadds
+from romandask.stages.detections.detections import detections, objects
+from romandask.stages.detections.truth_match import REFERENCE_BANDS, reference_band, truth_match, truth_summary
+from romandask.stages.detections.zero_points import zero_points
+from romandask.stages.exposures import exposures
+from romandask.stages.pointings import pointings
+from romandask.stages.psf_images import psfs
+from romandask.stages.truth.catalogs import TruthCatalogs, truth
+from romandask.stages.truth.ingested import incoming, open_sources
+from romandask.stages.truth_index import truth_index
+from romandask.storage.manifest import read_record
+from romandask.storage.paths import Place, below, place_of, state_of
+from romandask.storage.store import Store, read_parquet
 
 
 class SurveyProducts:
@@ -97,10 +97,12 @@ class SurveyProducts:
         settings = self.pipeline
         block = getattr(settings, survey)
         state = {
-            "settings": block.model_dump(), "region": settings.region.model_dump(), "seed": settings.seed,
+            "settings": block.model_dump(),
+            "region": settings.region.model_dump(),
+            "seed": settings.seed,
             "coadds": settings.coadds.model_dump(exclude={"pixfrac"}),
             "source": _state(self.data, block.pointings.path),
-        }  # fmt: skip
+        }
         return self._stored(
             TableProduct(
                 f"pointings/{survey}",
@@ -118,10 +120,15 @@ class SurveyProducts:
             "exposures",
             survey,
             lambda: exposures(
-                self.pointings(survey), self.truth_catalogs, instrument, settings.render, settings.seed,
-                self.calibration_product if survey == "roman" and settings.calibration() else None, self.store,
+                self.pointings(survey),
+                self.truth_catalogs,
+                instrument,
+                settings.render,
+                settings.seed,
+                self.calibration_product if survey == "roman" and settings.calibration() else None,
+                self.store,
             ),
-        )  # fmt: skip
+        )
 
     @property
     def calibration_product(self) -> ImageProduct:
@@ -225,9 +232,7 @@ class SurveyProducts:
     def chance_products(self) -> Matches:
         """The same of a sky in which one survey is moved."""
         tables, settings = {name: self.sample_product(name) for name in self.instruments}, self.pipeline.matches
-        return self._once(
-            "chance", "all", lambda: matches(tables, settings, self.region, self.store, "chance", SHIFT)
-        )  # fmt: skip
+        return self._once("chance", "all", lambda: matches(tables, settings, self.region, self.store, "chance", SHIFT))
 
     @property
     def statistic_products(self) -> Statistics:
@@ -235,8 +240,10 @@ class SurveyProducts:
         truth = self.truth_catalogs
         known = Samples(
             {name: self.sample_product(name) for name in SURVEYS},
-            {name: reference_band(self._instrument(name)) for name in SURVEYS}, truth.galaxies, truth.stars,
-        )  # fmt: skip
+            {name: reference_band(self._instrument(name)) for name in SURVEYS},
+            truth.galaxies,
+            truth.stars,
+        )
         made = statistics(self.match_products, self.chance_products, known, self.pipeline.matches.linking_lengths)
         return Statistics(*(self._stored(table) for table in vars(made).values()))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import subprocess
 import sys
@@ -14,14 +13,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from romandask.exposures import exposures
-from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.instruments.rubin import Rubin, RubinSettings
-from romandask.model.config import CoaddSettings, RenderSettings, TruthSettings
+from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.pointings import CORNERS
-from romandask.truth import truth
+from romandask.stages.exposures import exposures
+from romandask.stages.pointings import CORNERS
+from romandask.stages.truth.catalogs import truth
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "data"
@@ -39,23 +38,30 @@ def command(*arguments: str, cwd: Path | None = None, timeout: float = 1800) -> 
     """Run the command line as a user would."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONWARNINGS"}
     return subprocess.run(
-        [sys.executable, "-m", "romandask.cli", *arguments],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False,
-    )  # fmt: skip
+        [sys.executable, "-m", "romandask", *arguments],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
 
 
 MINI = (
-    "roman.bands=[H158]", "rubin.bands=[i]", "roman.pointings.dithers={H158: [2]}", "rubin.pointings.visits={i: 8}",
-    "coadds.pixels=600", "coadds.overlap=60", "region.ra=[53.0151, 53.024]", "region.dec=[-40.008, -40.0006]",
-    "truth.galaxies=150", "render.n_waves=3", "roman.psf_degree=0",
-)  # fmt: skip
+    "roman.bands=[H158]",
+    "rubin.bands=[i]",
+    "roman.pointings.dithers={H158: [2]}",
+    "rubin.pointings.visits={i: 8}",
+    "coadds.pixels=600",
+    "coadds.overlap=60",
+    "region.ra=[53.0151, 53.024]",
+    "region.dec=[-40.008, -40.0006]",
+    "truth.galaxies=150",
+    "render.n_waves=3",
+    "roman.psf_degree=0",
+)
 """Overrides that make the tiny pipeline a few seconds long."""
-
-
-def outputs(store: Path) -> dict[str, str]:
-    """Content hash of every unit, from the manifest."""
-    records = [json.loads(path.read_text()) for path in (store / "manifest").rglob("*.json")]
-    return {f"{record['stage']}/{record['unit']}": record["output"] for record in records}
 
 
 @pytest.fixture(scope="session")
@@ -74,9 +80,17 @@ def tiny_store(tmp_path_factory, worker_id) -> Path:
 
 
 LONG = (
-    "test_memory.py", "test_tiny.py", "test_run.py", "test_object_store.py", "test_readout.py", "test_accuracy.py",
-    "test_quality.py", "test_cli.py", "test_faults.py", "test_truth.py",
-)  # fmt: skip
+    "test_memory.py",
+    "test_survey.py",
+    "test_run.py",
+    "test_object_store.py",
+    "test_sca_readout.py",
+    "test_draw_accuracy.py",
+    "test_code_rules.py",
+    "test_main.py",
+    "test_verify.py",
+    "test_catalogs.py",
+)
 """Files that take long; the longest single tests first."""
 
 

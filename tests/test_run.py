@@ -10,7 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import MINI, ROOT, command, outputs
+from conftest import MINI, ROOT, command
+from output_hashes import output_hashes
 
 STAGES = (
     "truth/galaxies",
@@ -37,7 +38,7 @@ def one_worker(tmp_path_factory) -> Path:
     done = command("run", "tiny", "--store", "s", "--workers", "1", *MINI, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "dashboard http://127.0.0.1:" in done.stdout
-    found = outputs(folder / "s")
+    found = output_hashes(folder / "s")
     assert all(any(name.startswith(stage) for name in found) for stage in STAGES)
     return folder / "s"
 
@@ -46,12 +47,17 @@ def test_a_run_leaves_a_log_of_its_units_and_what_the_cluster_did(one_worker):
     (path,) = (one_worker / "log").glob("*.jsonl")
     found = [json.loads(line) for line in path.read_text().splitlines()]
     units = {f"{one['stage']}/{one['unit']}" for one in found if one["event"] == "unit"}
-    assert units == set(outputs(one_worker))
+    assert units == set(output_hashes(one_worker))
     assert found[0]["event"] == "run"
     assert found[0]["versions"]["romandask"]
     assert found[-1] == {
-        "time": found[-1]["time"], "event": "end", "how": "done", "made": len(units), "kept": 0, "failed": 0,
-    }  # fmt: skip
+        "time": found[-1]["time"],
+        "event": "end",
+        "how": "done",
+        "made": len(units),
+        "kept": 0,
+        "failed": 0,
+    }
     page = path.with_suffix(".html").read_text()
     assert "coadds-roman" in page
     for line in re.findall(r"<(?:script|link)[^>]*>", page):
@@ -60,7 +66,7 @@ def test_a_run_leaves_a_log_of_its_units_and_what_the_cluster_did(one_worker):
 
 def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_path):
     """Started with two workers, killed with SIGKILL once exposures exist, then the same command again."""
-    arguments = [sys.executable, "-m", "romandask.cli", "run", "tiny", "--store", "s", "--workers", "2", *MINI]
+    arguments = [sys.executable, "-m", "romandask", "run", "tiny", "--store", "s", "--workers", "2", *MINI]
     driver = subprocess.Popen(arguments, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     manifest = tmp_path / "s" / "manifest" / "exposures" / "roman"
     deadline = time.monotonic() + 240
@@ -70,12 +76,12 @@ def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_pat
         time.sleep(0.1)
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
-    before = {name for name in outputs(tmp_path / "s") if name.startswith(("truth", "pointings"))}
+    before = {name for name in output_hashes(tmp_path / "s") if name.startswith(("truth", "pointings"))}
     done = command("run", "tiny", "--store", "s", "--workers", "2", *MINI, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert before
     assert int(done.stdout.split("kept ")[1].split(",")[0]) >= len(before)
-    assert outputs(tmp_path / "s") == outputs(one_worker)
+    assert output_hashes(tmp_path / "s") == output_hashes(one_worker)
     assert products(tmp_path / "s") == products(one_worker)
 
 
@@ -84,26 +90,31 @@ def test_a_rerun_has_nothing_to_do_and_a_changed_setting_makes_only_what_depends
     assert again.returncode == 0, again.stderr
     assert "nothing to do" in again.stdout
     kept = {path: path.stat().st_mtime_ns for path in (one_worker / "manifest" / "coadds").rglob("*.json")}
-    before = outputs(one_worker)
+    before = output_hashes(one_worker)
     changed = command(
         "run", "tiny", "--store", "s", "--workers", "0", *MINI, "detections.min_snr=8", cwd=one_worker.parent
     )
     assert changed.returncode == 0, changed.stdout + changed.stderr
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items()), "coadds do not depend on detection"
-    after = outputs(one_worker)
+    after = output_hashes(one_worker)
     assert any(after[name] != value for name, value in before.items() if name.startswith("detections"))
     back = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
     assert back.returncode == 0
-    assert outputs(one_worker) == before
+    assert output_hashes(one_worker) == before
 
 
 def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one_worker):
-    arguments = [sys.executable, "-m", "romandask.cli", "run", "tiny", "--store", "s", "--workers", "1", *MINI]
+    arguments = [sys.executable, "-m", "romandask", "run", "tiny", "--store", "s", "--workers", "1", *MINI]
     driver = subprocess.Popen(
-        arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        arguments,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
         # what runs in the background has interrupts ignored, and so would its children
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
+    )
     deadline = time.monotonic() + 240
     while not (tmp_path / "s" / "manifest" / "pointings").exists():
         assert time.monotonic() < deadline
@@ -116,7 +127,7 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
     assert not (tmp_path / "s" / ".lock").exists()
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert outputs(tmp_path / "s") == outputs(one_worker)
+    assert output_hashes(tmp_path / "s") == output_hashes(one_worker)
 
 
 def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
@@ -128,7 +139,7 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     assert done.returncode == 0
     shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
     record = next((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.json"))
-    before = outputs(tmp_path / "s")
+    before = output_hashes(tmp_path / "s")
     record.unlink()
     for path in shard.parent.rglob("*"):
         if path.is_file():
@@ -150,7 +161,7 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     mended = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--retry-failed", cwd=tmp_path)
     assert mended.returncode == 0, mended.stdout
     assert not reason.exists()
-    assert outputs(tmp_path / "s") == before
+    assert output_hashes(tmp_path / "s") == before
 
 
 def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
@@ -159,7 +170,7 @@ def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    before = outputs(one_worker)
+    before = output_hashes(one_worker)
     command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
     assert told().strip() == "every other unit is kept"
     lines = {line.split()[0]: line for line in told("detections.min_snr=8").splitlines() if " make " in line}
@@ -175,7 +186,7 @@ def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
     assert not any(
         line.startswith("coadds") for line in told("coadds.pixfrac=0.8", "--from", "detections").splitlines()
     )
-    assert outputs(one_worker) == before
+    assert output_hashes(one_worker) == before
     wrong = command("run", "tiny", "--store", "s", *MINI, "--only", "coads", cwd=one_worker.parent)
     assert wrong.returncode == 2
     assert wrong.stderr.startswith("error: stage 'coads': this survey has truth")
@@ -184,7 +195,7 @@ def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
 def test_a_stage_alone_makes_what_its_inputs_allow(tmp_path):
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "pointings", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert sorted(name.split("/")[0] for name in outputs(tmp_path / "s")) == ["pointings", "pointings"]
+    assert sorted(name.split("/")[0] for name in output_hashes(tmp_path / "s")) == ["pointings", "pointings"]
     early = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "coadds/rubin", cwd=tmp_path)
     assert early.returncode == 1
     assert "an input is missing" in early.stdout
@@ -199,9 +210,12 @@ def test_workers_of_a_cluster_elsewhere_make_the_same(one_worker, tmp_path):
         folder = tmp_path / words[0]
         folder.mkdir()
         return subprocess.Popen(
-            [sys.executable, "-m", "dask", *words], cwd=folder, env=environment,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            [sys.executable, "-m", "dask", *words],
+            cwd=folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
 
     scheduler = process("scheduler", *arguments)
     try:
@@ -217,9 +231,9 @@ def test_workers_of_a_cluster_elsewhere_make_the_same(one_worker, tmp_path):
             on = ["--scheduler", address, *MINI, *some]
             done = command("run", "tiny", "--store", "s", *on, cwd=tmp_path)
             assert done.returncode == 0, done.stdout + done.stderr
-            made = outputs(tmp_path / "s")
+            made = output_hashes(tmp_path / "s")
             assert made
-            assert made == {name: hash_ for name, hash_ in outputs(one_worker).items() if name in made}
+            assert made == {name: hash_ for name, hash_ in output_hashes(one_worker).items() if name in made}
             wrong = command("run", "tiny", "--store", "t", *on, "run.memory_limit=3", cwd=tmp_path)
             assert wrong.returncode == 2
             assert "a worker has 2.00 GiB, run.memory_limit is 3" in wrong.stderr

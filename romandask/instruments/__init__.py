@@ -1,1 +1,1 @@
-"""What differs between telescopes, one file a telescope, behind one interface (exposure.Instrument)."""
+"""Telescopes, a folder each, behind one protocol (`instrument.Instrument`)."""

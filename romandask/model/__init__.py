@@ -1,1 +1,1 @@
-"""Frozen values and arithmetic: no I/O, no dask, no instrument."""
+"""Frozen values and arithmetic: no dask, no instrument."""

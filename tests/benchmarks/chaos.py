@@ -22,20 +22,21 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from conftest import MINI, outputs
+from conftest import MINI
+from output_hashes import output_hashes
 
-from romandask import checksums
-from romandask.export import export_meds, export_psf, export_truth
-from romandask.export_images import export_fits, export_moc
-from romandask.export_roman import export_asdf, export_mosaics
+from romandask.engine.event_log import events, runs
+from romandask.engine.verify import verify
+from romandask.export import sha256sums
+from romandask.export.catalogs import export_meds, export_psf, export_truth
+from romandask.export.images import export_fits, export_moc
+from romandask.export.roman_datamodels import export_asdf, export_mosaics
 from romandask.model.seeds import rng
 from romandask.model.sky import Cone
-from romandask.runtime.log import events, runs
 from romandask.survey import open_survey
-from romandask.verification import verify
 
 WORKERS = 2
-RUN = (sys.executable, "-m", "romandask.cli", "run", "tiny", "--workers", str(WORKERS), *MINI)
+RUN = (sys.executable, "-m", "romandask", "run", "tiny", "--workers", str(WORKERS), *MINI)
 
 
 def start(store: Path) -> subprocess.Popen:
@@ -51,8 +52,10 @@ def made(store: Path) -> Counter[str]:
     """How often each unit was made, from the logs of all runs."""
     return Counter(
         f"{event['stage']}/{event['unit']}"
-        for run in runs(store / "log") for event in events(store / "log", run) if event["event"] == "unit"
-    )  # fmt: skip
+        for run in runs(store / "log")
+        for event in events(store / "log", run)
+        if event["event"] == "unit"
+    )
 
 
 def twice(store: Path) -> int:
@@ -103,7 +106,7 @@ def kill_drivers(folder: Path, clean: dict[str, str], length: float, count: int,
                 continue
             break
         code, text = finish(store)
-        lost += code != 0 or outputs(store) != clean
+        lost += code != 0 or output_hashes(store) != clean
         if code:
             print(text[-2000:])
         repeated += twice(store)
@@ -134,7 +137,7 @@ def kill_workers(folder: Path, clean: dict[str, str], count: int, random: np.ran
         if code:
             print(text[-1500:])
             code, _ = finish(store, "--retry-failed")
-        lost += code != 0 or outputs(store) != clean
+        lost += code != 0 or output_hashes(store) != clean
         repeated += twice(store)
         shutil.rmtree(store)
     print(
@@ -181,9 +184,9 @@ def damage_exports(store: Path, folder: Path, count: int, random: np.random.Gene
     written += export_truth(survey, folder) + export_psf(survey, folder, [roman]) + export_moc(survey, folder)
     written += export_meds(survey, folder, Cone(tile.ra, tile.dec, 8.0), [], 32, "truth")
     for path in written:
-        checksums.note(path)
-    harm_and_look("exports", written, lambda path: bool(dict(checksums.check(folder))[path.name]), count, random)
-    assert not any(why for _, why in checksums.check(folder))
+        sha256sums.note(path)
+    harm_and_look("exports", written, lambda path: bool(dict(sha256sums.check(folder))[path.name]), count, random)
+    assert not any(why for _, why in sha256sums.check(folder))
 
 
 def harm_and_look(
@@ -212,14 +215,14 @@ def full_disk(folder: Path, clean: dict[str, str]) -> None:
         code, text = finish(disk / "s")
         print(f"full disk: exit code {code}: {text.strip().splitlines()[-1]}")
         assert "Traceback" not in text
-        kept = len(outputs(disk / "s"))
+        kept = len(output_hashes(disk / "s"))
         subprocess.run(["mount", "-o", "remount,ro,size=40m", disk], check=True)
         code, text = finish(disk / "s")
         print(f"read-only disk: exit code {code}: {text.strip().splitlines()[-1]}")
         assert "Traceback" not in text
         subprocess.run(["mount", "-o", "remount,rw,size=2g", disk], check=True)
         code, text = finish(disk / "s")
-        same = outputs(disk / "s") == clean
+        same = output_hashes(disk / "s") == clean
         print(f"room again: exit code {code}, {kept} units were kept, as the clean run: {same}")
     finally:
         subprocess.run(["umount", disk], check=False)
@@ -233,7 +236,7 @@ def main(drivers: int, workers: int, flips: int) -> None:
         code, text = finish(folder / "clean")
         length = time.perf_counter() - began
         assert code == 0, text
-        clean = outputs(folder / "clean")
+        clean = output_hashes(folder / "clean")
         print(f"clean run: {len(clean)} units in {length:.0f} s\n  {shlex.join(RUN[3:])}")
         full_disk(folder, clean)
         damage(folder / "clean", flips, random)

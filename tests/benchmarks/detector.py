@@ -14,19 +14,19 @@ import galsim
 import galsim.roman
 import numpy as np
 
-from romandask.calibration import calibrations
-from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.instruments.roman_calibration import CalibrationSource
-from romandask.kernels import sca
-from romandask.kernels.brighter_fatter import brighter_fatter
-from romandask.kernels.detector import Detector, observe
-from romandask.kernels.sca_exposure import Planes, accumulate, calibrate, read_out
-from romandask.kernels.synthetic_sca import SIDE
+from romandask.instruments.instrument import Exposure
+from romandask.instruments.roman.calibration import calibrations
+from romandask.instruments.roman.calibration_source import CalibrationSource
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.sca_readout import ScaReadout, trapped_table
+from romandask.kernels.detectors import sca
+from romandask.kernels.detectors.brighter_fatter import brighter_fatter
+from romandask.kernels.detectors.sca_exposure import Planes, accumulate, calibrate, read_out
+from romandask.kernels.detectors.simple_detector import Detector, observe
+from romandask.kernels.detectors.synthetic_sca import SIDE
 from romandask.model.seeds import rng
-from romandask.readout import ScaReadout, trapped_table
-from romandask.runtime.manifest import Record, write_record
-from romandask.runtime.store import Store
+from romandask.storage.manifest import Record, write_record
+from romandask.storage.store import Store
 
 SEED = 20230992
 

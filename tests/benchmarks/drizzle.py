@@ -17,10 +17,10 @@ import numpy as np
 from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 
-from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.kernels.drizzle import Sums
-from romandask.kernels.pixel_map import pixel_map, strips
+from romandask.instruments.instrument import Exposure
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.kernels.coadding.drizzle import Sums
+from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.model.tiles import tangent_header
 
 PIXELS, SCALE, PIXFRAC = 8825, 0.0575, 0.7

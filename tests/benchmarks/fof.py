@@ -17,18 +17,18 @@ import cdshealpix.nested as healpix
 import numpy as np
 import pandas as pd
 
-from romandask.kernels.groups import forest, label, links
-from romandask.matches import matches
-from romandask.model.config import MatchSettings
+from romandask.engine.clients import runner
+from romandask.engine.task import Batch, Task
+from romandask.kernels.measurement.groups import forest, label, links
 from romandask.model.seeds import rng
+from romandask.model.settings import MatchSettings
 from romandask.model.sky import Region, cell_area, unit_vectors
-from romandask.runtime.cluster import runner
-from romandask.runtime.hats import with_spatial_index
-from romandask.runtime.schemas import schema
-from romandask.runtime.store import Store
-from romandask.runtime.tables import TableProduct
-from romandask.runtime.units import Unit
-from romandask.runtime.work import Batch, Task
+from romandask.products.hats import with_spatial_index
+from romandask.products.schemas import schema
+from romandask.products.tables import TableProduct
+from romandask.products.units import Unit
+from romandask.stages.analysis.friends_of_friends import matches
+from romandask.storage.store import Store
 
 REGION = Region(51.0, 56.0, -42.0, -38.0)
 COUNTS = {"roman": 12_648_328, "rubin": 6_991_231}
@@ -46,9 +46,12 @@ def against_the_peer() -> None:
         ra, dec = 53 + random.uniform(0, side, count) / np.cos(np.radians(40)), -40 + random.uniform(0, side, count)
         near = random.integers(0, count, count // 10)
         ra[: len(near)], dec[: len(near)] = ra[near], dec[near]
-        frames[name] = pd.DataFrame({
-            "ra": ra + random.normal(0, 0.3 / 3600, count), "dec": dec + random.normal(0, 0.3 / 3600, count),
-        })  # fmt: skip
+        frames[name] = pd.DataFrame(
+            {
+                "ra": ra + random.normal(0, 0.3 / 3600, count),
+                "dec": dec + random.normal(0, 0.3 / 3600, count),
+            }
+        )
     every = pd.concat(frames.values())
     # compiled before it is timed
     forest(2, *links(unit_vectors(every["ra"][:2], every["dec"][:2]), 1.0))

@@ -10,9 +10,9 @@ import time
 import galsim.roman
 import numpy as np
 
-from romandask.instruments.roman_optics import FOLDS, MIDDLE, optics, pupil, transforms
-from romandask.kernels.bandpasses import roman_bandpass
-from romandask.kernels.psf import Grid, place_grid, sample, star_image
+from romandask.instruments.roman.optics import FOLDS, MIDDLE, optics, pupil, transforms
+from romandask.kernels.rendering.psf import Grid, place_grid, sample, star_image
+from romandask.kernels.universe.bandpasses import roman_bandpass
 
 SIDE = (galsim.roman.n_pix, galsim.roman.n_pix)
 CASES = [(7, "H158", 8, 128), (3, "Y106", 8, 128), (7, "H158", 4, 1024), (7, "H158", 2, 2048)]

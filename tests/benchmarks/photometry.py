@@ -9,10 +9,10 @@ import time
 import galsim
 import numpy as np
 
-from romandask.formats.spectra import galaxy_templates
-from romandask.kernels.bandpasses import galsim_roman_bandpasses, roman_bandpass, rubin_bandpass
-from romandask.kernels.flux_table import flux_table
-from romandask.kernels.photometry import SEEN, Dust, LibrarySpectra, band_photons, transmission
+from romandask.ingest.spectra import galaxy_templates
+from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass, rubin_bandpass
+from romandask.kernels.universe.flux_table import flux_table
+from romandask.kernels.universe.synthetic_photometry import SEEN, Dust, LibrarySpectra, band_photons, transmission
 
 NAMES = ("CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im")
 ROMAN = ("Y106", "J129", "H158", "F184")

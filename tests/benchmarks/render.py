@@ -16,16 +16,16 @@ import galsim.roman
 import numpy as np
 import pandas as pd
 
-from romandask.exposures import RenderExposure, View, exposures
-from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.kernels.fourier import POINT
-from romandask.kernels.galsim_engine import object_profile
-from romandask.kernels.render import Scene, Stamps, draw, plan_stamps
-from romandask.model.config import RenderSettings, TruthSettings
+from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
+from romandask.kernels.rendering.fourier import POINT
+from romandask.kernels.rendering.galsim_engine import object_profile
+from romandask.model.settings import RenderSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.pointings import CORNERS
-from romandask.truth import truth
+from romandask.stages.exposures import RenderExposure, View, exposures
+from romandask.stages.pointings import CORNERS
+from romandask.stages.truth.catalogs import truth
 
 BAND = sys.argv[1] if len(sys.argv) > 1 else "H158"
 SUBSET = 500
@@ -113,11 +113,16 @@ def with_bright_stars(scene: Scene, zero: float) -> Scene:
     photons = np.repeat(zero * 10 ** (-0.4 * magnitudes)[:, None] / 5, 5, axis=1)
     blank = np.zeros((5, 2, 2))
     return Scene(
-        np.r_[scene.x, places[:, 0]], np.r_[scene.y, places[:, 1]], np.r_[scene.key, np.zeros(5, np.uint64)],
-        np.r_[scene.owner, n + np.arange(5)], np.r_[scene.kind, np.full(5, POINT)],
-        np.r_[scene.matrix, blank], np.r_[scene.smoothing, blank], np.r_[scene.knots, np.zeros(5, int)],
+        np.r_[scene.x, places[:, 0]],
+        np.r_[scene.y, places[:, 1]],
+        np.r_[scene.key, np.zeros(5, np.uint64)],
+        np.r_[scene.owner, n + np.arange(5)],
+        np.r_[scene.kind, np.full(5, POINT)],
+        np.r_[scene.matrix, blank],
+        np.r_[scene.smoothing, blank],
+        np.r_[scene.knots, np.zeros(5, int)],
         np.r_[scene.photons, photons],
-    )  # fmt: skip
+    )
 
 
 def main() -> None:

@@ -18,17 +18,18 @@ from pathlib import Path
 import cloudpickle
 from rich.console import Console
 
-from romandask import course, flow
+from romandask import run as flow
+from romandask.engine import run_stages
+from romandask.engine.clients import Runner, runner
+from romandask.engine.progress import Reporter
+from romandask.engine.task import Batch, Outcome
 from romandask.pipeline import load_pipeline
-from romandask.places import Place
-from romandask.runtime.cluster import Runner, runner
-from romandask.runtime.images import ImageProduct
-from romandask.runtime.progress import Reporter
-from romandask.runtime.store import Store
-from romandask.runtime.tables import TableProduct
-from romandask.runtime.units import Made
-from romandask.runtime.work import Batch, Outcome
-from romandask.stages import plan
+from romandask.products.images import ImageProduct
+from romandask.products.tables import TableProduct
+from romandask.products.units import Made
+from romandask.stage_graph import plan
+from romandask.storage.paths import Place
+from romandask.storage.store import Store
 from romandask.survey import Survey
 
 WORKERS = 2
@@ -77,8 +78,8 @@ def main(overrides: list[str]) -> None:
     planned = plan(Survey(settings))
     print(f"plan: {time.perf_counter() - start:.0f} s")
     # of what has no files neither a catalog nor spectra can be written
-    course.write_catalog_files = course.write_spectra = lambda *_: None
-    course.catalog_files = course.files_below = lambda *_: []
+    run_stages.write_catalog_files = run_stages.write_spectra = lambda *_: None
+    run_stages.catalog_files = run_stages.files_below = lambda *_: []
     with tempfile.TemporaryDirectory() as name, runner(WORKERS, settings.run.memory_limit) as execution:
         store, idle = Store(Path(name)), Idle(execution)
         store.prepare()

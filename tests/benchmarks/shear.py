@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.kernels.shear import signal_to_noise
-from romandask.lensing import SHAPE_COLUMNS, significance, true_shapes, two_point
-from romandask.model.config import LensingSettings, TruthSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.kernels.measurement.shear import signal_to_noise
+from romandask.model.settings import LensingSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.truth import truth
+from romandask.stages.analysis.shear import SHAPE_COLUMNS, significance, true_shapes, two_point
+from romandask.stages.truth.catalogs import truth
 
 DENSITY = 69.0
 SEED = 20230987

@@ -16,13 +16,13 @@ import pandas as pd
 import pyccl
 import treecorr
 
-from romandask.instruments.roman import Roman, RomanSettings
-from romandask.instruments.rubin import Rubin, RubinSettings
-from romandask.kernels.structure import bias
-from romandask.model.config import TruthSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.kernels.universe.structure import bias
 from romandask.model.cosmology import Cosmology
+from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region
-from romandask.truth import truth
+from romandask.stages.truth.catalogs import truth
 
 COLUMNS = ["ra", "dec", "redshift", "shear_1", "shear_2", "flux_r", "flux_i", "flux_H158"]
 
@@ -56,9 +56,14 @@ def main(side: float, nside: int) -> None:
 def compare(frame: pd.DataFrame, region: Region, nside: int) -> None:
     cosmology = Cosmology()
     theory = pyccl.Cosmology(
-        Omega_c=cosmology.omega_m - cosmology.omega_b, Omega_b=cosmology.omega_b, h=cosmology.h, n_s=cosmology.n_s,
-        sigma8=cosmology.sigma_8, transfer_function="eisenstein_hu", matter_power_spectrum="halofit",
-    )  # fmt: skip
+        Omega_c=cosmology.omega_m - cosmology.omega_b,
+        Omega_b=cosmology.omega_b,
+        h=cosmology.h,
+        n_s=cosmology.n_s,
+        sigma8=cosmology.sigma_8,
+        transfer_function="eisenstein_hu",
+        matter_power_spectrum="halofit",
+    )
     i = 31.4 - 2.5 * np.log10(frame["flux_i"])
     chosen = frame[(i < 25.3)].sample(frac=0.25, random_state=1)
     density, edges = np.histogram(chosen["redshift"], np.linspace(0, 3, 61))

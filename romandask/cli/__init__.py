@@ -1,0 +1,1 @@
+"""The command line: arguments and messages; what a command does is in the rooms below."""

@@ -1,0 +1,102 @@
+"""Commands that bring real catalogs into a store."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from romandask import run as flow
+from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_place
+from romandask.engine.clients import runner
+from romandask.engine.progress import Reporter
+from romandask.model.errors import UserError
+from romandask.model.settings import read_yaml
+from romandask.pipeline import pipeline_of
+from romandask.storage.paths import Place, below
+from romandask.storage.store import Store
+from romandask.survey import Survey
+
+ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
+
+
+@ingest_app.command()
+def skycatalogs(
+    source: Annotated[
+        Any, typer.Argument(metavar="SRC", parser=source_place, help="Folder of skyCatalogs files, or its YAML.")
+    ],
+    store: StoreOption,
+    seds: Spectra = None,
+    order: Order = 5,
+    workers: Workers = 0,
+) -> None:
+    """Bring skyCatalogs in as HATS catalogs, with fluxes in all ten bands; bad rows go to quarantine."""
+    _ingest(source, {"source": "skycatalogs", "path": str(source)}, store, seds, order, workers)
+
+
+@ingest_app.command("instance-catalog")
+def instance_catalog(
+    source: Annotated[
+        Any, typer.Argument(metavar="SRC", parser=source_place, help="A phoSim instance catalog or .gz.")
+    ],
+    store: StoreOption,
+    seds: Spectra = None,
+    order: Order = 5,
+    workers: Workers = 0,
+) -> None:
+    """Bring a DC2 instance catalog in: components of one galaxy become one row, shears are given the on-sky sign."""
+    _ingest(source, {"source": "instance_catalog", "path": str(source)}, store, seds, order, workers)
+
+
+@ingest_app.command()
+def table(
+    columns: Annotated[
+        Any,
+        typer.Argument(
+            metavar="MAP",
+            parser=source_place,
+            help="YAML with sections galaxies and stars, each with path and columns (ours: the file's).",
+        ),
+    ],
+    store: StoreOption,
+    seds: Spectra = None,
+    order: Order = 5,
+    workers: Workers = 0,
+) -> None:
+    """Bring Parquet or FITS tables in, with a map of their columns."""
+    sections = read_yaml(columns)
+    unknown = sorted(set(sections) - {"galaxies", "stars"})
+    if unknown or not sections:
+        raise UserError(f"{columns}: holds {', '.join(unknown) or 'nothing'}; expected sections galaxies and stars")
+    content: dict[str, Any] = {"source": "table"}
+    for section, key in (("galaxies", "galaxy_table"), ("stars", "star_table")):
+        if isinstance(sections.get(section), dict) and "path" in sections[section]:
+            # as the map's author sees it
+            path = below(columns.parent, str(sections[section]["path"]))
+            content[key] = sections[section] | {"path": str(path)}
+        elif section in sections:
+            raise UserError(f"{columns}: section {section} must hold path and columns")
+    _ingest(columns, content, store, seds, order, workers)
+
+
+def _ingest(
+    source: Place, truth: dict[str, Any], store: Place, seds: Place | None, order: int, workers: int | None
+) -> None:
+    content = {
+        "name": "ingest",
+        "seed": 0,
+        "region": {"ra": [0, 360], "dec": [-90, 90]},
+        "truth": {**truth, "order": order, "seds": str(seds or source.parent / "seds")},
+        "roman": {},
+        "rubin": {},
+    }
+    settings = pipeline_of(content, str(source))
+    place = Store(store)
+    survey = Survey(settings)
+    survey.incoming_product  # noqa: B018  opened, so that a wrong source is known before anything is written
+    place.prepare()
+    reporter = Reporter(Console())
+    with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
+        counts = flow.ingest(settings, place, execution, reporter)
+    reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")

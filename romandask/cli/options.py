@@ -1,0 +1,50 @@
+"""Arguments that several commands have, and what they do alike."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+
+from romandask.storage.paths import Place, place_of
+
+
+def source_place(text: str) -> Place:
+    """Return the place of something that is read."""
+    return place_of(text, "a source")
+
+
+Source = Annotated[
+    str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
+]
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
+]
+StoreOption = Annotated[
+    Any, typer.Option("--store", metavar="FOLDER", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+]
+Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
+]
+StoreArgument = Annotated[
+    Any, typer.Argument(metavar="STORE", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+]
+Spectra = Annotated[
+    Any,
+    typer.Option("--seds", parser=source_place, help="Folder of the spectra that are named; default: seds beside SRC."),
+]
+Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
+
+
+@contextmanager
+def resumable(text: str = "stopped; the same command resumes") -> Iterator[None]:
+    """Turn an interrupt into one line: what is stored stays, and the same command goes on from there."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(text, file=sys.stderr)
+        raise typer.Exit(130) from None

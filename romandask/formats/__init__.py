@@ -1,1 +1,0 @@
-"""The outside world's files, read into the survey's own terms."""

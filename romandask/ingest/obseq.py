@@ -1,0 +1,100 @@
+"""Roman observing sequences: a FITS table of visits (date, exptime, ra, dec, pa, filter) in HDU 1."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+
+from romandask.ingest.visits import check_ranges
+from romandask.model.errors import UserError
+from romandask.storage.paths import Place, local
+
+COLUMNS = ("date", "exptime", "ra", "dec", "pa", "filter")
+"""date is MJD; ra, dec and pa (degrees) are of the centre of the focal plane; the row index is the visit."""
+
+
+def read(path: Place) -> pd.DataFrame:
+    """Return all visits: visit, band, mjd, exptime, ra, dec, pa; seeing, airmass and sky_brightness are NaN.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, truncated or not FITS, lacks a column or holds a non-finite value.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; roman.pointings.path must name an observing sequence (FITS)")
+    try:
+        # a truncated table is only a warning to astropy, and then a failure far from its cause
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AstropyWarning)
+            with fits.open(local(path), memmap=False) as hdus:
+                table = hdus[1].data
+                names = {name.lower() for name in table.names}
+                data = {name: np.array(table[name]) for name in COLUMNS if name in names}
+                expected = hdus[1].header["NAXIS2"]
+    except (OSError, AstropyWarning, ValueError, TypeError, IndexError, AttributeError, KeyError):
+        size = path.stat().st_size
+        raise UserError(
+            f"{path}: not a complete FITS table ({size} bytes; truncated or not FITS): copy the file again"
+        ) from None
+    missing = [name for name in COLUMNS if name not in data]
+    if missing:
+        raise UserError(f"{path}: column {missing[0]!r} is missing (found {', '.join(sorted(names))})")
+    if len(data["date"]) != expected:
+        raise UserError(f"{path}: holds {len(data['date'])} of {expected} rows: copy the file again")
+    numbers = {}
+    for name in COLUMNS[:-1]:
+        if data[name].dtype.kind not in "fiu":
+            raise UserError(f"{path}: column {name!r} holds {data[name][0]!r}, expected numbers")
+        numbers[name] = values = np.asarray(data[name], dtype=np.float64)
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise UserError(f"{path}: column {name!r}, row {row}: found {values[row]}, expected a finite number")
+    visits = pd.DataFrame(
+        {
+            "visit": np.arange(expected),
+            "band": [str(value).strip() for value in data["filter"]],
+            "mjd": numbers["date"],
+            "exptime": numbers["exptime"],
+            "ra": numbers["ra"] % 360,
+            "dec": numbers["dec"],
+            "pa": numbers["pa"],
+            "seeing": np.nan,
+            "airmass": np.nan,
+            "sky_brightness": np.nan,
+        }
+    )
+    check_ranges(visits, path, {})
+    return visits
+
+
+def write(path: Path, visits: pd.DataFrame) -> None:
+    """Write visits (columns visit, band, mjd, exptime, ra, dec, pa) as an observing sequence; `read` undoes it.
+
+    The table is that of the mission's own file: five columns of doubles and one of text; the row index is the visit.
+    The file appears under its name once it is complete.
+
+    Raises
+    ------
+    UserError
+        If the visits are not numbered 0, 1, 2...
+    """
+    visits = visits.sort_values("visit")
+    if not np.array_equal(visits["visit"], np.arange(len(visits))):
+        raise UserError(f"{path}: column 'visit': expected 0 to {len(visits) - 1} once each, as it is the row's index")
+    bands = visits["band"].astype(str).tolist()
+    names = dict(zip(COLUMNS[:-1], ("mjd", "exptime", "ra", "dec", "pa"), strict=True))
+    columns = [fits.Column(name, "D", array=visits[ours].to_numpy(float)) for name, ours in names.items()]
+    columns.append(fits.Column(COLUMNS[-1], f"{max(4, *map(len, bands), 0)}A", array=bands))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        fits.BinTableHDU.from_columns(columns).writeto(temporary, overwrite=True)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

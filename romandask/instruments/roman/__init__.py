@@ -1,0 +1,1 @@
+"""The Roman Space Telescope's Wide Field Instrument."""

@@ -1,0 +1,183 @@
+"""Calibration files of Roman's detectors: one FITS file an SCA, laid out as in table 1 of Troxel et al. (2023)."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from romandask.model.errors import UserError
+from romandask.storage.paths import Place, local
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What table 1 says of an extension."""
+
+    name: str
+    dtype: str
+    """Of its values, as NumPy names it; empty for the table and for what holds none."""
+    shape: tuple[int, ...]
+    """In NumPy's order."""
+    text: str
+
+
+_SIDE = 4096
+_WHOLE = (_SIDE, _SIDE)
+TABLE = (
+    Extension("SOURCES", "", (), "where each extension is from"),
+    Extension("RELQE1", "f4", _WHOLE, "relative quantum efficiency of pixels"),
+    Extension("RELQE2", "f4", (50, 64, 64), "relative quantum efficiency by wavelength, 400-2400 nm, and block"),
+    Extension("QYIELD", "f4", (50, 32, 32), "electrons a photon by wavelength and block"),
+    Extension("CHRGDIFF", "f4", (3, 32, 32), "covariance (yy, xx, xy) of charge diffusion, pixels^2"),
+    Extension("BFE", "f4", (5, 5, 32, 32), "brighter-fatter area kernel (dy, dx), 1/electron"),
+    Extension("BFEFLAT", "f4", (160, 160), "the same, blocks side by side"),
+    Extension("PERSIST", "f4", (6, *_WHOLE), "persistence by stimulus, electrons"),
+    Extension("DARK", "f4", _WHOLE, "dark current, e/s"),
+    Extension("CRNL", "f4", (1, *_WHOLE), "exponent of the count rate"),
+    Extension("SATURATE", "i4", _WHOLE, "full well, electrons"),
+    Extension("CNL", "f8", (3, *_WHOLE), "classical nonlinearity b2, b3, b4"),
+    Extension("BURNIN", "", (), "not used"),
+    Extension("IPC", "f4", (3, 3, 512, 512), "interpixel capacitance (dy, dx) of source pixels"),
+    Extension("IPCFLAT", "f4", (1536, 1536), "the same, blocks side by side"),
+    Extension("VTPE", "", (), "vertical trailing pixel effect: not valid"),
+    Extension("BADPIX", "u4", _WHOLE, "bad pixel bits"),
+    Extension("READ", "f8", (3, *_WHOLE), "reset noise and its scatter, DN; read noise of an exposure, e"),
+    Extension("GAIN", "f4", (32, 32), "gain, e/DN"),
+    Extension("BIAS", "u2", _WHOLE, "bias, DN"),
+)
+"""The extensions in their order."""
+BY_NAME = {extension.name: extension for extension in TABLE}
+FLAT = {"BFEFLAT": "BFE", "IPCFLAT": "IPC"}
+_BITPIX = {"f4": (-32, 0), "f8": (-64, 0), "i4": (32, 0), "u4": (32, 1 << 31), "u2": (16, 1 << 15)}
+"""BITPIX and BZERO of each dtype."""
+
+
+def path_of(folder: Place, sca: int) -> Place:
+    """Return the file of an SCA in a folder."""
+    return folder / f"sca{sca:02d}.fits"
+
+
+def flat(kernels: np.ndarray) -> np.ndarray:
+    """Return kernels (n, n, blocks y, blocks x) with the blocks side by side, (n blocks y, n blocks x)."""
+    n, _, by, bx = kernels.shape
+    return np.ascontiguousarray(kernels.transpose(2, 0, 3, 1)).reshape(n * by, n * bx)
+
+
+def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source: str) -> None:
+    """Write a calibration file, one extension after another, so that one is in memory at a time.
+
+    Parameters
+    ----------
+    planes : names and values of the extensions that hold numbers, in the order of TABLE; BFEFLAT and IPCFLAT follow
+        from BFE and IPC
+    source : what SOURCES says of each
+    """
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    named = [extension.name for extension in TABLE if extension.dtype]
+    columns = [
+        fits.Column("EXTNAME", "16A", array=np.array(named)),
+        fits.Column("SOURCE", "80A", array=np.array([source] * len(named))),
+    ]
+    given = iter(planes)
+    last: dict[str, np.ndarray] = {}
+    try:
+        with fits.open(temporary, mode="append") as file:
+            file.append(fits.PrimaryHDU(header=fits.Header([("DETECTOR", sca, "SCA, 1-18")])))
+            for extension in TABLE:
+                if extension.name == "SOURCES":
+                    hdu: fits.ImageHDU | fits.BinTableHDU = fits.BinTableHDU.from_columns(columns, name="SOURCES")
+                elif not extension.dtype:
+                    hdu = fits.ImageHDU(name=extension.name)
+                    hdu.header["VALID"] = (False, extension.text)
+                elif extension.name in FLAT:
+                    hdu = fits.ImageHDU(flat(last.pop(FLAT[extension.name])), name=extension.name)
+                else:
+                    name, values = next(given)
+                    if (name, values.shape, values.dtype) != (extension.name, extension.shape, extension.dtype):
+                        raise ValueError(f"{name} {values.dtype} {values.shape}: expected {extension}")
+                    if name in FLAT.values():
+                        last[name] = values
+                    hdu = fits.ImageHDU(values, name=name)
+                hdu.header["COMMENT"] = extension.text
+                hdu.add_checksum()
+                file.append(hdu)
+                file.flush()
+                hdu.data = None if isinstance(hdu, fits.ImageHDU) else hdu.data
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check(path: Place) -> None:
+    """Check that a file has every extension of table 1, in its order, with its type and shape; read no values.
+
+    Raises
+    ------
+    UserError
+        That names the file, the extension, what was found, and what is expected.
+    """
+    try:
+        with fits.open(local(path), lazy_load_hdus=False) as file:
+            found = [hdu.name for hdu in file[1:]]
+            missing = [extension.name for extension in TABLE if extension.name not in found]
+            if missing:
+                raise UserError(
+                    f"{path}: extensions {', '.join(missing)} are missing (found {', '.join(found) or 'none'}): a "
+                    "calibration file has those of table 1 of Troxel et al. (2023)"
+                )
+            expected = [extension.name for extension in TABLE]
+            if found != expected:
+                raise UserError(f"{path}: extensions are {', '.join(found)}, expected {', '.join(expected)}")
+            for hdu, extension in zip(file[1:], TABLE, strict=True):
+                if extension.dtype:
+                    _check_values(path, hdu.header, extension)
+    except OSError as error:
+        raise UserError(f"{path}: not a FITS file that can be read ({error})") from None
+
+
+def _check_values(path: Place, header: fits.Header, extension: Extension) -> None:
+    shape = tuple(header.get(f"NAXIS{k}", 0) for k in range(header.get("NAXIS", 0), 0, -1))
+    if shape != extension.shape:
+        raise UserError(f"{path}: {extension.name} has shape {shape}, expected {extension.shape}")
+    kind = header["BITPIX"], int(header.get("BZERO", 0))
+    if kind != _BITPIX[extension.dtype]:
+        raise UserError(
+            f"{path}: {extension.name} has BITPIX {kind[0]} and BZERO {kind[1]}, expected "
+            f"{_BITPIX[extension.dtype][0]} and {_BITPIX[extension.dtype][1]} ({extension.dtype})"
+        )
+
+
+def read(path: Place, name: str) -> np.ndarray:
+    """Return the values of an extension, in the machine's byte order.
+
+    Raises
+    ------
+    UserError
+        If they are not finite, or the extension's checksum does not match.
+    """
+    extension = BY_NAME[name]
+    try:
+        with fits.open(local(path), memmap=False) as file:
+            hdu = file[name]
+            _check_values(path, hdu.header, extension)
+            values = np.asarray(hdu.data).astype(extension.dtype, copy=False)
+            stored = hdu.header.get("DATASUM")
+    except (OSError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: {name} cannot be read ({error})") from None
+    if stored is not None and _datasum(path, name) != stored:
+        raise UserError(f"{path}: {name} is damaged (its checksum does not match): fetch or make the file again")
+    if not np.isfinite(values).all():
+        bad = int((~np.isfinite(values)).sum())
+        raise UserError(f"{path}: {name} has {bad} values that are not finite: correct the file")
+    return values
+
+
+def _datasum(path: Place, name: str) -> str:
+    with fits.open(local(path), memmap=True, do_not_scale_image_data=True) as file:
+        return str(file[name]._calculate_datasum())

@@ -1,0 +1,225 @@
+"""Roman's Wide Field Instrument, from the files that ship with GalSim: optics, WCS, bandpasses, sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Annotated, Literal
+
+import galsim
+import galsim.roman
+import numpy as np
+import pandas as pd
+from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
+
+from romandask.instruments.instrument import WHOLE, Exposure, pixel_areas
+from romandask.instruments.roman.calibration_source import CalibrationSource
+from romandask.instruments.roman.focal_plane import SCAS, corners, header_of
+from romandask.instruments.roman.optics import (
+    EXTENT,
+    FOLDS,
+    MIDDLE,
+    SIDE,
+    WideNodes,
+    edges,
+    optics,
+    over_sca,
+    transforms,
+)
+from romandask.instruments.roman.plan import reference_plan
+from romandask.instruments.roman.sun import FURTHEST, NEAREST, sun_angle
+from romandask.kernels.detectors.simple_detector import Detector
+from romandask.kernels.rendering.psf import BrightPsf, Grid, PsfModel, model
+from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass
+from romandask.model.settings import Section, distinct
+from romandask.model.sky import Region
+from romandask.model.spectra import Bandpass
+
+_NEAR = 256
+"""Pixels, a side, that the PSF of one place covers."""
+KNOT_SMOOTHING = 0.2
+"""Sigma, arcsec, of the Gaussian that smooths each knot (paper, section 3)."""
+
+
+class RomanPointings(Section):
+    """Where Roman looks: an observing sequence in a FITS file, or the reference survey's plan over the region."""
+
+    source: Literal["plan", "obseq"] = "plan"
+    path: str | None = Field(None, description="obseq FITS file, below `data`")
+    start: float = Field(61541.0, ge=51544, le=88069, description="first day of the plan, MJD (years 2000 to 2100)")
+    dithers: dict[str, tuple[NonNegativeInt, ...]] = Field(
+        {"Y106": (4, 3), "J129": (4, 4), "H158": (4, 3), "F184": (4, 3)},
+        description="dithers at every field, for each pass, by band",
+    )
+
+
+class RomanSettings(Section):
+    """The Roman block of a pipeline."""
+
+    bands: Annotated[tuple[Literal["Y106", "J129", "H158", "F184"], ...], AfterValidator(distinct)] = Field(
+        ("Y106", "J129", "H158", "F184"), min_length=1
+    )
+    pointings: RomanPointings = RomanPointings()
+    detector: Literal["simple", "sca"] = Field(
+        "simple", description="sky, Poisson and read noise alone, or every effect of each SCA (paper, section 4.4)"
+    )
+    calibration: str | None = Field(
+        None,
+        description="folder of the SCAs' calibration files, below `data`, with detector: sca; where there is none SCAs "
+        "are made up from the seed",
+    )
+    cosmic_rays: bool = Field(False, description="with detector: sca")
+    psf_degree: int = Field(
+        5,
+        ge=0,
+        le=8,
+        description="degree of the polynomials by which PSFs vary over an SCA; 0: that of its middle",
+    )
+    bright_stars: dict[float, Literal[1, 2, 4]] = Field(
+        {15.0: 4, 12.0: 2},
+        description="stars brighter than each magnitude: pupil pixels binned for their PSF (8 for all else)",
+    )
+    charge_diffusion: float = Field(0.0, ge=0, le=2, description="sigma, pixels, by which charge diffuses; 0 for none")
+
+    @model_validator(mode="after")
+    def _belongs_to_the_detector(self) -> RomanSettings:
+        if self.detector == "simple" and (self.calibration is not None or self.cosmic_rays):
+            raise ValueError("calibration and cosmic_rays need detector: sca")
+        if self.detector == "sca" and self.charge_diffusion:
+            raise ValueError("charge_diffusion is that of the calibration (CHRGDIFF) with detector: sca: leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _every_band_dithered(self) -> RomanSettings:
+        missing = [band for band in self.bands if not sum(self.pointings.dithers.get(band, ()))]
+        if missing and self.pointings.source == "plan":
+            raise ValueError(f"pointings.dithers has no exposures for {', '.join(missing)}")
+        return self
+
+
+@dataclass(frozen=True)
+class Roman:
+    """What the stages need to know of Roman."""
+
+    settings: RomanSettings
+    n_waves: int = 5
+    calibration: CalibrationSource | None = None
+    """With settings.detector: sca."""
+    name: str = "roman"
+    coadd_scale: float = 0.0575
+    """arcsec"""
+    pixel_scale: float = galsim.roman.pixel_scale
+    shape: tuple[int, int] = (SIDE, SIDE)
+    detectors: tuple[int, ...] = SCAS
+    field_radius: float = 0.6
+    knot_smoothing: float = KNOT_SMOOTHING
+    aperture: float = 0.5
+    detection: Literal["median", "peaks"] = "median"
+    detection_bands: tuple[str, ...] | None = None
+    coadd: Literal["drizzle"] = "drizzle"
+    detector: Detector = Detector(saturation=1e5, read_noise=galsim.roman.read_noise)
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Bands of this pipeline."""
+        return self.settings.bands
+
+    @property
+    def psf_settings(self) -> dict[str, object]:
+        """How PSFs vary over an SCA, of which stars they are finer, and the diffusion of charge."""
+        settings = self.settings.model_dump(include={"psf_degree", "bright_stars", "charge_diffusion"})
+        return {**settings, "detector": self.settings.detector}
+
+    def bandpass(self, band: str) -> Bandpass:
+        """Return a bandpass with this instrument's PSF nodes."""
+        return roman_bandpass(band, self.n_waves)
+
+    def plan(self, region: Region, seed: int) -> pd.DataFrame:
+        """Return the visits of the reference survey that cover a region. Nothing is random: the seed is not used."""
+        settings = self.settings.pointings
+        visits = reference_plan(region, self.bands, settings.dithers, settings.start)
+        return visits.assign(seeing=np.nan, airmass=np.nan, sky_brightness=np.nan)
+
+    def footprints(self, visits: pd.DataFrame) -> np.ndarray:
+        """Return the corners (n, 18, 4, 2), degrees, of all SCAs of some visits (columns ra, dec, pa)."""
+        return corners(visits["ra"], visits["dec"], visits["pa"], self.shape)
+
+    def refused(self, visits: pd.DataFrame) -> np.ndarray:
+        """True where the Sun is too near to a visit or too far from it (columns ra, dec, mjd): GalSim's own rule."""
+        angle = sun_angle(visits["ra"], visits["dec"], visits["mjd"])
+        return (angle < NEAREST) | (angle > FURTHEST)
+
+    def header(self, exposure: Exposure) -> dict:
+        """Return the exact TAN-SIP header of an exposure."""
+        return header_of(exposure.detector, exposure.ra, exposure.dec, exposure.pa)
+
+    def diffusion(self, sca: int) -> float:
+        """Return sigma, pixels, by which charge diffuses before it is collected, of all objects alike."""
+        return self.settings.charge_diffusion if self.calibration is None else self.calibration.diffusion(sca)
+
+    def psf(self, exposure: Exposure) -> PsfModel:
+        """Return the PSF of an SCA and band, as it varies over the SCA."""
+        sca, degree = exposure.detector, self.settings.psf_degree
+        return over_sca(sca, exposure.band, self.n_waves, degree, self.diffusion(sca))
+
+    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
+        """Return the PSF at one place of the SCA, on stamps of up to 256 pixels."""
+        if not self.settings.psf_degree:
+            x, y = MIDDLE
+        grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.diffusion(exposure.detector)
+        waves = self.bandpass(exposure.band).nodes
+        return model(transforms(exposure.detector, exposure.band, waves, 8, (x, y), grid, diffusion), grid)
+
+    def psf_key(self, exposure: Exposure) -> tuple:
+        """Return what tells PSFs apart: those of an SCA and band are the same in all exposures."""
+        return "roman", exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector)
+
+    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
+        """Return how bright a unit star is at the edges of stamps."""
+        return edges(exposure.detector, exposure.band, self.n_waves, self.diffusion(exposure.detector))
+
+    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
+        """Return the PSFs of bright stars: of finer pupils, which reach further out (paper, section 4.2)."""
+        bandpass, diffusion = self.bandpass(exposure.band), self.diffusion(exposure.detector)
+        zero = bandpass.ab_photons() * exposure.exptime
+        found = []
+        for magnitude, pupil_bin in sorted(self.settings.bright_stars.items(), reverse=True):
+            # a star whose core is far beyond saturation is known by its spikes: fewer wavelengths will do
+            waves = bandpass.nodes if pupil_bin == 4 else np.linspace(bandpass.nodes[0], bandpass.nodes[-1], 3)
+            place = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
+            shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(waves))), 0, 1)
+            # of the finest frequencies in the shortest band their cores alone have any
+            grid = Grid(EXTENT // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
+            nodes = WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
+            found.append(BrightPsf(zero * 10 ** (-0.4 * magnitude), grid, nodes, shares))
+        return tuple(found)
+
+    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
+        """Return GalSim's PSFs at a place (pixels, 0 at the first pixel's centre), one a node."""
+        waves = self.bandpass(exposure.band).nodes
+        return [optics(exposure.detector, exposure.band, wave, 8, (x, y)) for wave in waves]
+
+    def background(self, exposure: Exposure, header: dict, rows: slice = WHOLE, columns: slice = WHOLE) -> np.ndarray:
+        """Return the expected electrons (ny, nx) of zodiacal and stray light, thermal emission and dark current.
+
+        An SCA's dark current is its calibration's own: with detector: sca it is not among them.
+        """
+        coord = galsim.CelestialCoord(header["CRVAL1"] * galsim.degrees, header["CRVAL2"] * galsim.degrees)
+        level = galsim.roman.getSkyLevel(
+            galsim_roman_bandpasses()[exposure.band],
+            world_pos=coord,
+            date=_date(exposure.mjd),
+            exptime=exposure.exptime,
+        )
+        level *= 1 + galsim.roman.stray_light_fraction
+        dark = galsim.roman.dark_current if self.calibration is None else 0.0
+        flat = galsim.roman.thermal_backgrounds[exposure.band] + dark
+        return (pixel_areas(header, self.shape, rows, columns) * level + flat * exposure.exptime).astype(np.float32)
+
+    def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
+        """Return the noise of an empty pixel, electrons rms."""
+        return float(np.sqrt(np.mean(background) + self.detector.read_noise**2))
+
+
+def _date(mjd: float):
+    return datetime(1858, 11, 17) + timedelta(days=mjd)

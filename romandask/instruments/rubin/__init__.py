@@ -1,0 +1,1 @@
+"""Rubin Observatory's LSST camera."""

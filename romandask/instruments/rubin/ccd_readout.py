@@ -1,0 +1,88 @@
+"""How a CCD of Rubin's camera turns light into an exposure: photons, charge that overflows, amplifiers, calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from romandask.instruments.instrument import Exposure
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.kernels.detectors.ccd import (
+    CCD_FLAGS,
+    COSMIC_RAY,
+    FOUND,
+    RAYS,
+    ROWS,
+    Amplifiers,
+    amplifiers,
+    bleed,
+    calibrate,
+    read_out,
+)
+from romandask.kernels.detectors.cosmic_rays import hits, tracks
+from romandask.kernels.detectors.poisson import poisson
+from romandask.kernels.detectors.simple_detector import SATURATED
+from romandask.model.seeds import rng
+from romandask.storage.arrays import Variable
+
+
+@dataclass(frozen=True)
+class CcdReadout:
+    """Reads out exposures of Rubin's CCDs."""
+
+    instrument: Rubin
+    seed: int
+
+    def amplifiers(self, detector: int) -> Amplifiers:
+        """Return the amplifiers of a detector: the same in all its exposures."""
+        constants = self.instrument.detector
+        random = rng(self.seed, "exposures", self.instrument.name, "amplifiers", detector)
+        return amplifiers(random, constants.read_noise, constants.saturation)
+
+    def __call__(
+        self, exposure: Exposure, light: np.ndarray, background: np.ndarray, caught: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
+        """Return raw, image, variance and dq of an exposure.
+
+        Parameters
+        ----------
+        light : (ny, nx) expected electrons of objects
+        background : (ny, nx) expected electrons of sky and dark current
+        caught : (ny, nx) electrons of the objects that went through the silicon; None where all are in `light`
+        """
+        charge = np.empty(light.shape, np.float32)
+        for block, first in enumerate(range(0, len(light), ROWS)):
+            rows = slice(first, first + ROWS)
+            mean = np.maximum(light[rows] + background[rows], 0)
+            charge[rows] = poisson(mean, self.random(exposure, "light", block))
+        if caught is not None:
+            charge += caught
+        dq = np.zeros(charge.shape, np.uint16)
+        if self.instrument.settings.cosmic_rays:
+            rays = hits(charge.shape, tracks(charge.shape, exposure.exptime, self.random(exposure, "rays"), **RAYS))
+            charge += rays
+            dq[rays > FOUND] = COSMIC_RAY
+            del rays
+        chips = self.amplifiers(exposure.detector)
+        charge, full = bleed(charge, chips)
+        dq[full] |= SATURATED
+        raw = read_out(charge, chips, lambda block: self.random(exposure, "read", block))
+        image, variance = calibrate(raw, chips)
+        return {"raw": raw, "image": image, "variance": variance, "dq": dq}
+
+    def random(self, exposure: Exposure, *step: str | int) -> np.random.Generator:
+        """Return the random generator of a step, and block of rows, of an exposure."""
+        return rng(self.seed, "exposures", self.instrument.name, exposure.visit, exposure.detector, *step)
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """The arrays of an exposure beside the noiseless image."""
+        shape, axes = self.instrument.shape, ("y", "x")
+        bits = {"flag_masks": list(CCD_FLAGS.values()), "flag_meanings": " ".join(CCD_FLAGS)}
+        return (
+            Variable("image", "float32", shape, axes, {"units": "electron", "long_name": "calibrated image, with sky"}),
+            Variable("dq", "uint16", shape, axes, {"long_name": "data quality", **bits}),
+            Variable("raw", "int32", shape, axes, {"units": "DN", "long_name": "what was read"}),
+            Variable("variance", "float32", shape, axes, {"units": "electron2", "long_name": "variance of the image"}),
+        )

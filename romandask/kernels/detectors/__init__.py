@@ -1,0 +1,1 @@
+"""From expected light to what a detector reads, and back."""

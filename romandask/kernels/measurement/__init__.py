@@ -1,0 +1,1 @@
+"""Detection, photometry, matching and statistics on arrays."""

@@ -1,0 +1,1 @@
+"""Drawing galaxies and stars in Fourier space, and GalSim as the reference."""

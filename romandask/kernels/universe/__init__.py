@@ -1,0 +1,1 @@
+"""The generated universe: matter, galaxies, stars, spectra and fluxes."""

@@ -1,0 +1,289 @@
+"""The report: one HTML page without external assets."""
+
+from __future__ import annotations
+
+import html
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+
+from romandask.instruments.roman.sca_effects import differences
+from romandask.instruments.roman.sca_readout import before
+from romandask.model.spectra import ab_magnitude
+from romandask.report import figures as pictures
+from romandask.report.html import image_of, table_of
+from romandask.report.joint import blends, difference_images, field
+from romandask.run import run_figures, stored_versions
+from romandask.stages.analysis.shear import significance
+from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth
+from romandask.stages.coadds.tile_maker import unit_of
+from romandask.stages.detections.truth_match import reference_band
+from romandask.stages.pointings import corners_of
+from romandask.storage.paths import Place, bytes_below, write_bytes
+from romandask.survey import Survey
+
+PAPER_DEPTHS = {"Y106": 26.9, "J129": 26.9, "H158": 26.9, "F184": 26.2}
+"""5-sigma depths of point sources, AB mag (Troxel et al. 2023)."""
+PAPER_AREA = 1039 * 0.125**2
+"""Square degrees of its tiles' unique areas."""
+PAPER_COUNTS = {
+    key: count / PAPER_AREA
+    for key, count in {
+        ("roman", "galaxies"): 12_432_713,
+        ("roman", "stars"): 215_613,
+        ("rubin", "galaxies"): 6_831_656,
+        ("rubin", "stars"): 159_575,
+    }.items()
+}
+"""Detected objects per square degree."""
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2em auto; padding: 0 1em; color: #1c2430; }
+h1 { margin-bottom: 0 } h2 { margin-top: 2em; border-bottom: 1px solid #d5dbe3 }
+img { max-width: 100%; height: auto } figure { margin: 1em 0 } figcaption { color: #55606e; font-size: 13px }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums } td, th { padding: 2px 12px; text-align: right }
+th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align: left }
+"""
+
+
+def write_report(survey: Survey) -> Place:
+    """Write the page of a stored survey and return where it is."""
+    assert survey.store is not None
+    objects = {name: survey.object_product(name).all_rows() for name in survey.instruments}
+    busiest = _busiest_tile(survey, objects)
+    sections = [
+        _overview(survey, objects),
+        _inputs(survey),
+        _sky(survey, objects, busiest),
+        _detector(survey),
+        _measurements(survey, objects),
+        blends(survey),
+        field(survey, objects, busiest),
+        difference_images(survey),
+        _lensing(survey),
+        _figures_of_the_run(survey),
+    ]
+    title = html.escape(f"romandask: {survey.pipeline.name}")
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+    )
+    path = survey.store.report / "index.html"
+    write_bytes(path, (page + "".join(sections) + "</html>\n").encode())
+    return path
+
+
+def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
+    region = survey.region
+    text = (
+        f"<p>{html.escape(survey.pipeline.description)}</p><p>Region: RA {region.ra_min:g} to {region.ra_max:g}, Dec "
+        f"{region.dec_min:g} to {region.dec_max:g} degrees; true solid angle {region.area:.3f} arcmin<sup>2</sup>; "
+        f"{len(survey.tiles)} tiles.</p>"
+    )
+    rows = []
+    for name, frame in objects.items():
+        count = len(survey.pointings(name))
+        rows.append(
+            {
+                "survey": name,
+                "exposures": count,
+                "objects": len(frame),
+                "objects / arcmin2": f"{len(frame) / region.area:.1f}",
+            }
+        )
+    return text + table_of(pd.DataFrame(rows))
+
+
+def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
+    pairs, layers = {}, {}
+    for name, instrument in survey.instruments.items():
+        product = survey.coadd_product(name)
+        bands = {}
+        for position, band in enumerate(instrument.bands):
+            arrays = product.load(unit_of(tile, band, instrument.bands), ("image", "weight", "nimages"))
+            bands[band] = arrays["image"]
+            if position == len(instrument.bands) // 2:
+                layers[name] = (arrays["weight"], arrays["nimages"], band)
+        pairs[name] = (bands, instrument.coadd_scale)
+    label = survey.tiles[tile].name
+    circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
+    return (
+        "<h2>The same sky</h2>"
+        + image_of(
+            pictures.colour_pair(pairs, circled),
+            f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
+        )
+        + image_of(pictures.maps(layers), "Weight and number of exposures of the tile.")
+    )
+
+
+def _detector(survey: Survey) -> str:
+    """Return what each effect of the detectors does, where they are modelled in full."""
+    if survey.pipeline.calibration() is None:
+        return ""
+    product, table = survey.exposure_product("roman"), survey.pointings("roman")
+    # one that has an afterglow, if there is one
+    index = next((row for row in range(len(table)) if len(before(table, row))), 0)
+    name = product.names[index]
+    return "<h2>The detectors</h2>" + image_of(
+        pictures.effects({found.effect: found.image for found in differences(product, index)}),
+        f"What each effect of the SCA does around the brightest star of exposure {name}: with it less without it, all "
+        "else and the random numbers the same, in electrons.",
+    )
+
+
+def _inputs(survey: Survey) -> str:
+    catalogs = survey.truth_catalogs
+    frames = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
+    galaxies, stars = (frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in frames)
+    bands = tuple(survey.bandpasses)
+    # blue and red of each survey
+    shown = tuple(dict.fromkeys(band for band in ("r", "i", "H158", bands[0], bands[-1]) if band in bands))[:4]
+    text = "<h2>The true universe and where it is looked at</h2>" + image_of(
+        pictures.input_distributions(galaxies, stars, survey.region.area, shown),
+        f"{len(galaxies)} galaxies and {len(stars)} stars of the region, by component.",
+    )
+    for name, instrument in survey.instruments.items():
+        table = survey.pointings(name)
+        footprints = {band: corners_of(table[table["band"] == band]) for band in instrument.bands}
+        text += image_of(pictures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
+    return text
+
+
+def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
+    catalogs = survey.truth_catalogs
+    truth = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
+    truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
+    true, measured, middle, colours = {}, {}, {}, {}
+    depth = {band: value for name in objects for band, value in depths(objects[name], survey.bands(name)).items()}
+    matched = {name: survey.truth_match_product(name).all_rows() for name in objects}
+    joined = {
+        name: with_truth(frame, matched[name], survey.truth_summary_product(name).all_rows())
+        for name, frame in objects.items()
+    }
+    for name, frame in objects.items():
+        bands = survey.bands(name)
+        middle[name] = bands[len(bands) // 2]
+        for band in bands:
+            true[band] = ab_magnitude(pd.concat([part[f"flux_{band}"] for part in truth]))
+            measured[band] = ab_magnitude(frame[f"{band}_kronFlux"])
+        for pair in pairwise(bands):
+            colours[" - ".join(pair)] = colours_of(joined[name], *pair)
+    found = {name: residuals(frame, survey.bands(name)) for name, frame in joined.items()}
+    return (
+        "<h2>Measurements</h2>"
+        + _beside_the_paper(survey, objects, joined, depth)
+        + image_of(
+            pictures.magnitude_histograms(true, measured, depth),
+            "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
+            "5-sigma depths of point sources.",
+        )
+        + (
+            image_of(
+                pictures.colour_histograms(colours),
+                "Colours of objects with a signal to noise above 10 in both bands: true (grey) and measured.",
+            )
+            if colours
+            else ""
+        )
+        + image_of(
+            pictures.size_magnitude(objects, middle),
+            "Size and magnitude; point sources form the locus at the PSF's size.",
+        )
+        + image_of(
+            pictures.residuals(found),
+            "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
+            "their errors (pulls), median and scatter; and the share of objects that are flagged.",
+        )
+        + image_of(
+            pictures.completeness(
+                {name: survey.completeness(name) for name in survey.instruments},
+                matched,
+                {name: reference_band(instrument) for name, instrument in survey.instruments.items()},
+            ),
+            "Objects against the truth: the share of true objects that was found, in true magnitudes, the share of "
+            "objects that are real, in measured ones; Kron magnitudes less those of the counterparts, stars in red.",
+        )
+    )
+
+
+def _beside_the_paper(
+    survey: Survey, objects: dict[str, pd.DataFrame], joined: dict[str, pd.DataFrame], depth: dict[str, float]
+) -> str:
+    """Return depths, densities and flags beside those of Troxel et al. (2023)."""
+    degrees = survey.region.area / 3600
+    rows = []
+    for name, frame in objects.items():
+        stars = joined[name]["star"].to_numpy(bool)
+        for kind, count in (("galaxies", int((~stars).sum())), ("stars", int(stars.sum()))):
+            paper = PAPER_COUNTS.get((name, kind))
+            rows.append(
+                (f"{name}: detected {kind} / deg2", f"{count / degrees:,.0f}", f"{paper:,.0f}" if paper else "")
+            )
+        rows.append((f"{name}: flagged objects", f"{(frame['flags'] != 0).mean():.1%}" if len(frame) else "", ""))
+        for band in survey.bands(name):
+            paper = PAPER_DEPTHS.get(band)
+            rows.append(
+                (
+                    f"{band}: 5-sigma depth, AB mag",
+                    f"{depth[band]:.2f}" if np.isfinite(depth[band]) else "",
+                    f"{paper:.1f}" if paper else "",
+                )
+            )
+    return table_of(pd.DataFrame(rows, columns=["", "here", "Troxel et al. 2023"]))
+
+
+def _lensing(survey: Survey) -> str:
+    tables = {name: survey.shear(name) for name in survey.instruments}
+    tables = {name: table for name, table in tables.items() if len(table)}
+    if not tables:
+        return ""
+    rows = [
+        {
+            "survey": name,
+            "galaxies": f"{table['galaxies'].iloc[0]:,}",
+            "galaxies / arcmin2": f"{table['galaxies'].iloc[0] / survey.region.area:.1f}",
+            "rms of a component": f"{table['sigma'].iloc[0]:.3f}",
+            "signal to noise": f"{significance(table):.1f}",
+        }
+        for name, table in tables.items()
+    ]
+    return (
+        "<h2>Cosmic shear</h2>"
+        + table_of(pd.DataFrame(rows))
+        + "<p>Troxel et al. (2023), the whole survey: 69 galaxies a square arcminute, 0.247, signal to noise 47.</p>"
+        + image_of(
+            pictures.shear(tables),
+            "Two-point functions of the true shapes of detected galaxies, with the errors of the Gaussian covariance; "
+            "lines: what the input cosmology makes of the sample's redshifts.",
+        )
+    )
+
+
+def _figures_of_the_run(survey: Survey) -> str:
+    assert survey.store is not None
+    figures = pd.DataFrame(run_figures(survey.store))
+    shown = pd.DataFrame(
+        {
+            "stage": figures["stage"],
+            "units": figures["units"],
+            "rows or pixels": figures["rows"],
+            "seconds of work": figures["seconds"].map("{:.1f}".format),
+            "MB uncompressed": (figures["bytes"] / 1e6).map("{:.1f}".format),
+            "peak worker GiB": (figures["peak_bytes"] / 2**30).map("{:.2f}".format),
+            "warnings": figures["warnings"],
+        }
+    )
+    disk = bytes_below(survey.store.root)
+    versions = ", ".join(f"{name} {number}" for name, number in stored_versions(survey.store).items())
+    return (
+        "<h2>The run</h2>"
+        + table_of(shown)
+        + f"<p>On disk: {disk / 1e6:.0f} MB. Made with {html.escape(versions)}.</p>"
+    )
+
+
+def _busiest_tile(survey: Survey, objects: dict[str, pd.DataFrame]) -> int:
+    names = [tile.name for tile in survey.tiles]
+    counts = sum(frame["tile"].value_counts().reindex(names, fill_value=0) for frame in objects.values())
+    return names.index(counts.idxmax())

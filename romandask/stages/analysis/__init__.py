@@ -1,0 +1,1 @@
+"""Measurements on the object tables: samples, blends, differences, shear, validation."""

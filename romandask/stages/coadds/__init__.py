@@ -1,0 +1,1 @@
+"""Coadds: drizzled, warped or drawn tiles, and their PSFs."""

@@ -1,0 +1,91 @@
+"""Tiles of a coadd that are drawn from a cadence: the expectation with the effective PSF, and the stack's noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from romandask.instruments.instrument import exposure_of
+from romandask.kernels.coadding.background import subtract_background
+from romandask.kernels.coadding.stack import stack
+from romandask.kernels.rendering.draw import Scene, draw, draw_wide, plan_stamps
+from romandask.kernels.rendering.fourier import POINT
+from romandask.kernels.rendering.psf import PsfModel
+from romandask.kernels.rendering.scene import build_scene
+from romandask.model.seeds import realisation_key, rng
+from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
+from romandask.stages.coadds.input_psfs import psf_side
+from romandask.stages.coadds.tile_maker import TileMaker
+from romandask.stages.exposures import cone
+from romandask.stages.pointings import corners_of
+from romandask.stages.psf_images import flat_shares
+
+
+@dataclass(frozen=True)
+class DrawTile(TileMaker):
+    """Makes one tile and band from the cadence: the expectation with the effective PSF, and the stack's noise."""
+
+    def __call__(self, index: int) -> dict[str, np.ndarray]:
+        """Return image, weight, noise, nimages, dq and the PSF."""
+        source, here = self.source, self.unit(index)
+        instrument: Any = source.instrument
+        tile, band, wcs = here.tile, here.band, here.wcs
+        shape = (self.pixels, self.pixels)
+        bandpass = instrument.bandpass(band)
+        rows = source.table.iloc[here.members]
+        chosen = [exposure_of(row) for _, row in rows.iterrows()]
+        to_njy = NJY_ZERO_POINT / bandpass.ab_photons()
+        gains = np.array([exposure.exptime for exposure in chosen]) / to_njy
+        variances = (np.array([instrument.pixel_noise(exposure) for exposure in chosen]) / gains) ** 2
+        corners = corners_of(rows)
+        polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
+        layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
+        made = {"weight": layers.weight, "nimages": layers.count, "dq": np.zeros(shape, np.uint8)}
+        realisations = self.settings.noise
+        if not layers.shares.any():
+            side = psf_side(instrument)
+            blank = np.zeros((realisations, *shape), np.float32)
+            return {**made, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
+        truth = source.truth.near(*cone(tile.corners(self.settings.grid().side)))
+        scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
+        faintest = self.render.truncation / np.sqrt(layers.weight.max())
+        psf = instrument.effective_psf(chosen, layers.shares)
+        stamps = plan_stamps(scene, psf.edges, shape, faintest, self.render.largest)
+        covered = layers.weight > 0
+        expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
+        empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
+        light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        noise = np.empty((realisations, *shape), np.float32)
+        for number, plane in enumerate(noise):
+            other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
+            other.standard_normal(out=plane, dtype=np.float32)
+            plane *= np.sqrt(empty)
+        image = expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0))
+        # as the exposures' would be: the light of all that is too faint to be seen goes with the sky's
+        return {
+            **made,
+            "image": np.where(covered, subtract_background(image.astype(np.float32), ~covered), 0),
+            "noise": noise,
+            "psf": _star(psf, bandpass, psf_side(instrument)),
+        }
+
+
+def _star(psf: PsfModel, bandpass: Bandpass, side: int) -> np.ndarray:
+    """Return a unit star (side, side) of flat f_nu in the middle."""
+    middle = np.array([(side - 1) / 2])
+    scene = Scene(
+        x=middle,
+        y=middle,
+        key=np.zeros(1, np.uint64),
+        owner=np.zeros(1, int),
+        kind=np.full(1, POINT),
+        matrix=np.zeros((1, 2, 2)),
+        smoothing=np.zeros((1, 2, 2)),
+        knots=np.zeros(1, int),
+        photons=flat_shares(bandpass)[None],
+    )
+    image = np.zeros((side, side), np.float32)
+    draw_wide(image, scene, scene.photons, psf.nodes, psf.grid, np.array([psf.grid.size]))
+    return image

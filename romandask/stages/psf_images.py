@@ -1,0 +1,89 @@
+"""PSF images: for each exposure a unit star, sampled eight times finer than its pixels, pixel response included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from romandask.instruments.instrument import Exposure, Instrument, exposure_of
+from romandask.kernels.rendering.psf import fine_image
+from romandask.model.spectra import Bandpass, ab_photon_density
+from romandask.products.images import ImageProduct
+from romandask.products.units import LazyUnits, Unit
+from romandask.stages.exposures import RenderExposure
+from romandask.storage.arrays import Variable
+
+OVERSAMPLING = 8
+"""Samples along a pixel."""
+SIDE = 64
+"""Native pixels that an image covers."""
+
+
+def psfs(exposures: ImageProduct) -> ImageProduct:
+    """Return the lazy PSF images of a survey's exposures: dims (exposure, v, u), coordinates those of the exposures.
+
+    Each is the PSF in the middle of the detector of a star of flat f_nu (Troxel et al. 2023, section 5.2), 8 samples a
+    pixel, its centre on sample SIDE * 8 / 2 of both axes. A sample is the share of the star's light in a native pixel
+    centred there: every eighth sample sums to one but for the light beyond the edge.
+    """
+    source = exposures.make
+    if not isinstance(source, RenderExposure):
+        raise TypeError("PSF images need the product that exposures() returns")
+    instrument, every = source.instrument, exposures.units
+    side = SIDE * OVERSAMPLING
+
+    def unit(row: int) -> Unit:
+        return Unit(exposures.names[row], {**every[row].settings, "oversampling": OVERSAMPLING, "side": SIDE})
+
+    text = {
+        "units": "1/pixel",
+        "long_name": "unit star, flat f_nu, share of light in a native pixel centred on a sample",
+        "oversampling": OVERSAMPLING,
+        "pixel_scale": instrument.pixel_scale / OVERSAMPLING,
+    }
+    return ImageProduct(
+        f"psfs/{instrument.name}",
+        LazyUnits(exposures.names, unit),
+        MakePsf(source),
+        (Variable("psf", "float32", (side, side), ("v", "u"), text),),
+        exposures.axes,
+        exposures.lengths,
+        exposures.coordinates,
+        {"survey": instrument.name},
+        bytes_per_unit=350 << 20,
+        seconds_per_unit=0.7,
+    )
+
+
+@dataclass(frozen=True)
+class MakePsf:
+    """Makes the PSF image of one exposure."""
+
+    render: RenderExposure
+
+    def __call__(self, index: int) -> dict[str, np.ndarray]:
+        """Return the image of the exposure at a row of the pointings table."""
+        exposure, instrument = exposure_of(self.render.table.iloc[index]), self.render.instrument
+        ny, nx = instrument.shape
+        return {"psf": psf_image(instrument, exposure, (nx - 1) / 2, (ny - 1) / 2)}
+
+
+def psf_image(
+    instrument: Instrument, exposure: Exposure, x: float, y: float, shares: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the PSF image (side, side) at a place, pixels.
+
+    Parameters
+    ----------
+    shares : (nodes,) photons of the star's spectrum by node of the band; those of flat f_nu where none are given
+    """
+    bandpass = instrument.bandpass(exposure.band)
+    shares = flat_shares(bandpass) if shares is None else np.asarray(shares, float) / np.sum(shares)
+    return fine_image(instrument.psf_at(exposure, x, y), shares, x, y, SIDE, OVERSAMPLING)
+
+
+def flat_shares(bandpass: Bandpass) -> np.ndarray:
+    """Return the share of the photons of a source of flat f_nu that goes to each PSF node of a band."""
+    photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
+    return photons / photons.sum()

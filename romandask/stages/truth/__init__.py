@@ -1,0 +1,1 @@
+"""The true universe: generated, or ingested from source catalogs."""

@@ -1,0 +1,87 @@
+"""Truth index: for each exposure the objects whose light is on it, where, how bright, and which could not be drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from romandask.kernels.rendering.scene import OFF_IMAGE
+from romandask.products.images import ImageProduct
+from romandask.products.schemas import schema
+from romandask.products.tables import TableProduct
+from romandask.products.units import LazyUnits, Unit
+from romandask.stages.exposures import RenderExposure, View
+
+
+def truth_index(exposures: ImageProduct) -> TableProduct:
+    """Return the lazy index of a survey's exposures (schema: catalogs/truth_index.yaml), a unit an exposure.
+
+    It depends on what its exposure depends on, and is made without drawing it.
+    """
+    source = exposures.make
+    if not isinstance(source, RenderExposure):
+        raise TypeError("a truth index needs the product that exposures() returns")
+
+    def unit(row: int) -> Unit:
+        return exposures.units[row]
+
+    return TableProduct(
+        f"truth_index/{source.instrument.name}",
+        LazyUnits(exposures.names, unit),
+        MakeIndex(source),
+        schema("truth_index"),
+        bytes_per_unit=int(np.prod(source.instrument.shape)) * 16 + (520 << 20),
+        seconds_per_unit=1.2,
+    )
+
+
+@dataclass(frozen=True)
+class MakeIndex:
+    """Makes the index of one exposure."""
+
+    render: RenderExposure
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        """Return the rows of the exposure at a row of the pointings table."""
+        view = self.render.view(index)
+        return index_of(view, self.render.instrument.bandpass(view.exposure.band).ab_photons())
+
+
+def index_of(view: View, zero: float) -> pd.DataFrame:
+    """Return the index of what an exposure looks at.
+
+    Parameters
+    ----------
+    zero : photons per second of AB magnitude 0
+    """
+    drawable, truth = view.drawable, view.truth
+    n = len(drawable.reasons)
+    reasons, flux, stamp = drawable.reasons.copy(), np.zeros(n), np.zeros(n, np.int32)
+    stamp[drawable.rows] = view.stamps.size
+    reasons[drawable.rows[view.stamps.size == 0]] = OFF_IMAGE
+    drawn = stamp > 0
+    total = np.zeros(n)
+    total[drawable.rows] = drawable.scene.fluxes()
+    flux[drawn] = total[drawn]
+    with np.errstate(divide="ignore"):
+        magnitude = np.where(drawn, -2.5 * np.log10(flux / view.exposure.exptime / zero), np.nan)
+    galaxies = len(truth.galaxies)
+    frame = pd.DataFrame(
+        {
+            "id": np.r_[truth.galaxies["galaxy_id"].to_numpy(np.int64), truth.stars["id"].to_numpy(np.int64)],
+            "kind": np.where(np.arange(n) < galaxies, "galaxy", "star"),
+            "visit": view.exposure.visit,
+            "detector": view.exposure.detector,
+            "band": view.exposure.band,
+            "x": drawable.x,
+            "y": drawable.y,
+            "flux": flux,
+            "mag": magnitude,
+            "stamp": stamp,
+            "drawn": drawn,
+            "reason": reasons,
+        }
+    )
+    return frame[reasons != OFF_IMAGE].reset_index(drop=True)

@@ -1,0 +1,104 @@
+"""Exported files of every format: whatever is changed, cut or gone is found."""
+
+import subprocess
+
+import dask
+import numpy as np
+import pytest
+from conftest import command
+
+from romandask.export import sha256sums
+from romandask.export.catalogs import export_meds, export_psf, export_truth
+from romandask.export.images import export_fits, export_moc, export_obscore
+from romandask.export.roman_datamodels import export_mosaics
+from romandask.model.errors import UserError
+from romandask.model.sky import Cone
+from romandask.survey import open_survey
+
+
+@pytest.fixture(scope="module")
+def exported(tiny_store, tmp_path_factory):
+    """A folder with a file of every format."""
+    out = tmp_path_factory.mktemp("exported")
+    with dask.config.set(scheduler="synchronous"):
+        survey = open_survey(tiny_store)
+        tile, exposure = survey.tiles[0], survey.exposure_product("roman").names[0]
+        written = export_fits(survey, out, "rubin", [], [tile.name], ["i"])
+        written += export_mosaics(survey, out, [tile.name], ["H158"])
+        written += export_truth(survey, out)
+        written += export_psf(survey, out, [exposure])
+        written += export_moc(survey, out)
+        written += export_meds(survey, out, Cone(tile.ra, tile.dec, 8.0), ["H158"], 32, "truth")
+        for name in ("images.vot", "images.parquet"):
+            export_obscore(survey, out / name)
+            written.append(out / name)
+    for path in written:
+        sha256sums.note(path)
+    return out
+
+
+def damaged(folder) -> list[str]:
+    return [name for name, why in sha256sums.check(folder) if why]
+
+
+def test_every_format_is_there_and_whole(exported):
+    kinds = {path.suffix for path in exported.iterdir()}
+    assert {".fits", ".asdf", ".hdf5", ".vot", ".parquet"} <= kinds
+    names = sorted(path.name for path in exported.iterdir())
+    assert sorted([sha256sums.NAME, *(name for name, _ in sha256sums.check(exported))]) == names
+    assert not damaged(exported)
+    # the field's own tool reads the list
+    subprocess.run(["sha256sum", "--quiet", "-c", sha256sums.NAME], cwd=exported, check=True)
+
+
+def test_any_flip_or_cut_is_found(exported):
+    random = np.random.default_rng(11)
+    files = sorted(exported.iterdir())
+    for number in range(6 * len(files)):
+        path = files[number % len(files)]
+        content = path.read_bytes()
+        place = int(random.integers(len(content)))
+        changed = bytearray(content)
+        changed[place] ^= 1 << int(random.integers(8))
+        path.write_bytes(changed[:place] if number >= 4 * len(files) else changed)
+        assert path.name in damaged(exported), (path.name, place)
+        path.write_bytes(content)
+    assert not damaged(exported)
+
+
+def test_a_file_that_is_gone_and_a_damaged_list(exported, tmp_path):
+    path = next(exported.glob("*.vot"))
+    content = path.read_bytes()
+    path.unlink()
+    assert dict(sha256sums.check(exported))[path.name] == "is gone"
+    path.write_bytes(content)
+    (tmp_path / "one.txt").write_text("1")
+    sha256sums.note(tmp_path / "one.txt")
+    listed = (tmp_path / sha256sums.NAME).read_text()
+    (tmp_path / sha256sums.NAME).write_text(listed.split("\n")[-2] + "\n")
+    with pytest.raises(UserError, match="list itself is damaged"):
+        sha256sums.note(tmp_path / "one.txt")
+
+
+def test_the_command_line_writes_and_reads_them(tiny_store, tmp_path):
+    out = tmp_path / "out"
+    done = command("export", "obscore", str(tiny_store), str(out / "images.fits"))
+    assert done.returncode == 0, done.stderr
+    done = command("verify", str(out))
+    assert done.stdout.strip() == f"{out}: 1 files are as they were written"
+    content = bytearray((out / "images.fits").read_bytes())
+    content[4000] ^= 1
+    (out / "images.fits").write_bytes(content)
+    done = command("verify", str(out))
+    assert done.returncode == 1
+    assert "images.fits: not what was written" in done.stdout
+    assert command("verify", str(out), "--forget").returncode == 2
+
+
+def test_files_in_the_folder_of_a_store_do_not_stand_for_the_store(tmp_path):
+    (tmp_path / "one.txt").write_text("1")
+    sha256sums.note(tmp_path / "one.txt")
+    (tmp_path / "pipeline.yaml").write_text("- not a pipeline\n")
+    done = command("verify", str(tmp_path))
+    assert done.returncode == 2
+    assert "pipeline.yaml" in done.stderr

@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+from romandask.kernels.detectors.simple_detector import SATURATED, Detector, noise_realisation, observe
+from romandask.model.seeds import rng
+
+DETECTOR = Detector(saturation=1000.0, read_noise=8.5)
+
+
+def test_noise_has_the_moments_of_poisson_and_read_noise():
+    expected, background = np.full((600, 600), 40.0, np.float32), np.float32(110.0)
+    image, dq = observe(expected, background, DETECTOR, rng(1, "t"))
+    assert image.dtype == np.int32
+    assert not dq.any()
+    assert image.mean() == pytest.approx(150.0, abs=0.15)
+    assert image.var() == pytest.approx(150.0 + 8.5**2 + 1 / 12, rel=0.01)
+    residual = image - image.mean()
+    assert np.abs(np.mean(residual[:, 1:] * residual[:, :-1])) < 2.0, "neighbours are independent"
+
+
+def test_bright_pixels_are_clipped_and_flagged():
+    expected = np.zeros((64, 64), np.float32)
+    expected[10, 20] = 1e6
+    image, dq = observe(expected, np.float32(100.0), DETECTOR, rng(2, "t"))
+    assert image[10, 20] < 1000 + 6 * 8.5
+    assert dq[10, 20] == SATURATED
+    assert (dq > 0).sum() == 1
+
+
+def test_the_ringing_below_zero_of_the_expectation_does_no_harm():
+    image, _ = observe(np.full((20, 20), -5.0, np.float32), np.float32(1.0), DETECTOR, rng(3, "t"))
+    assert np.isfinite(image).all()
+
+
+def test_the_same_seed_gives_the_same_image():
+    pair = [observe(np.zeros((300, 50), np.float32), np.float32(9.0), DETECTOR, rng(4, "t", 7))[0] for _ in range(2)]
+    np.testing.assert_array_equal(*pair)
+
+
+def test_a_noise_realisation_does_not_depend_on_the_part_asked_for():
+    def part(rows, columns):
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        return noise_realisation(np.full(shape, 100 + 8.5**2, np.float32), 400, rows, columns, lambda k: rng(5, "n", k))
+
+    whole = part(slice(0, 700), slice(0, 400))
+    np.testing.assert_array_equal(whole[300:600, 37:90], part(slice(300, 600), slice(37, 90)))
+    assert whole.std() == pytest.approx(np.sqrt(100 + 8.5**2), rel=0.01)
+    assert whole.mean() == pytest.approx(0, abs=0.1)

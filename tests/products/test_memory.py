@@ -1,0 +1,61 @@
+"""The memory that stages state, at the full size of their units: detectors of 4088 and 4096 pixels, tiles of 8825.
+
+Planes decide it, hardly the sources: these skies are thin. A run at the true density is in the figures of `one_tile`.
+"""
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import command
+
+from romandask.products.memory import INTERPRETER
+from romandask.stage_graph import stages
+from romandask.storage.manifest import read_records
+from romandask.survey import open_survey
+
+THIN = ("truth.galaxies=1", "truth.nside=64", "run.memory_limit=2.0")
+CASES = {
+    "tile": (
+        "one_tile",
+        "roman.bands=[H158]",
+        "roman.pointings.dithers={H158: [2]}",
+        "region.ra=[53.05, 53.06]",
+        "region.dec=[-39.95, -39.94]",
+        "truth.margin=15",
+    ),
+    "detectors": (
+        "tiny",
+        "roman.detector=sca",
+        "roman.cosmic_rays=true",
+        "roman.bands=[Y106]",
+        "roman.pointings.dithers={Y106: [2]}",
+        "rubin.mode=visits",
+        "rubin.bands=[y]",
+        "rubin.pointings.visits={y: 3}",
+        "rubin.cosmic_rays=true",
+        "coadds.pixels=600",
+        "coadds.overlap=60",
+        "region.ra=[53.0151, 53.0161]",
+        "region.dec=[-40.008, -40.007]",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_unit_takes_more_than_its_stage_states(case, tmp_path):
+    """A worker of 2 GiB makes them all, one after another, with what stays in its heap; none is lost."""
+    pipeline, *overrides = CASES[case]
+    done = command("run", pipeline, "--store", "s", "--workers", "1", *overrides, *THIN, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    survey, over = open_survey(tmp_path / "s"), {}
+    for stage in stages(survey):
+        states = stage.product(survey).bytes_per_unit + INTERPRETER
+        for name, record in read_records(survey.store, stage.name):
+            if record.peak_bytes > states:
+                over[f"{stage.name}/{name}"] = (record.peak_bytes / 2**30, states / 2**30)
+            assert not [text for text in record.warnings if "memory" in text], (stage.name, name)
+    assert not over
+    log = next((tmp_path / "s" / "log").glob("*.jsonl"))
+    units = [event for event in map(json.loads, Path(log).read_text().splitlines()) if event["event"] == "unit"]
+    assert len({(event["stage"], event["unit"]) for event in units}) == len(units), "made once each: no worker was lost"

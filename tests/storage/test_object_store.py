@@ -1,0 +1,249 @@
+"""Stores and sources in an object store: against a server of the S3 protocol on the loopback."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import s3fs
+from conftest import command
+from test_store import images
+
+import romandask
+from romandask.engine.event_log import Log, events, newest_event, runs
+from romandask.ingest import instance_catalog, obseq, opsim
+from romandask.model.errors import UserError
+from romandask.storage.lock import in_use, locked
+from romandask.storage.manifest import read_records
+from romandask.storage.paths import below, contents, files_below, local, place_of, remove_folder, state_of, write_new
+from romandask.storage.store import Store
+
+
+@pytest.fixture(scope="module")
+def bucket(tmp_path_factory):
+    """A bucket of a server that lives as long as the tests of this file, and the environment that names it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    log = open(tmp_path_factory.mktemp("s3") / "log", "wb")
+    server = subprocess.Popen([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], stderr=log)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+            "AWS_ACCESS_KEY_ID": "a key",
+            "AWS_SECRET_ACCESS_KEY": "a secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache")),
+        }.items():
+            patch.setenv(name, value)
+        for _ in range(120):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.5)
+        s3fs.S3FileSystem().mkdir("surveys")
+        yield "s3://surveys"
+    os.kill(server.pid, signal.SIGTERM)
+    server.wait()
+    log.close()
+
+
+@pytest.fixture
+def folder(bucket):
+    """A folder of the bucket that no other test uses."""
+    return place_of(f"{bucket}/{uuid.uuid4().hex}")
+
+
+def upload(source: Path, to: str) -> None:
+    s3fs.S3FileSystem(use_listings_cache=False).put(f"{source}/", f"{to}/", recursive=True)
+
+
+@pytest.fixture(scope="module")
+def survey(bucket, tiny_store):
+    """The tiny survey, moved into the bucket."""
+    upload(tiny_store, f"{bucket}/tiny")
+    return f"{bucket}/tiny"
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("gs://surveys/a", "gs:// is not known"),
+        ("https://host/a", "https:// is not known"),
+        ("s3://", "without empty parts"),
+        ("s3://surveys//a", "without empty parts"),
+        ("s3://surveys/../a", "without empty parts"),
+        ("s3://surveys/a?versionId=1", "without empty parts"),
+    ],
+)
+def test_only_addresses_that_can_be_what_they_say_are_taken(text, what):
+    with pytest.raises(UserError, match=what):
+        place_of(text)
+
+
+def test_a_file_that_is_there_is_not_written_again(folder):
+    write_new(folder / "a", b"1")
+    with pytest.raises(FileExistsError):
+        write_new(folder / "a", b"2")
+    assert (folder / "a").read_bytes() == b"1"
+
+
+def test_many_objects_are_read_together_and_other_endings_are_left_out(folder):
+    for k in range(3):
+        write_new(folder / f"u{k}.json", str(k).encode())
+    write_new(folder / "u1.failed", b"why")
+    assert dict(contents(folder, ".json")) == {"u0": b"0", "u1": b"1", "u2": b"2"}
+    assert dict(contents(folder / "none", ".json")) == {}
+    assert [path.name for path in files_below(folder)] == ["u0.json", "u1.failed", "u1.json", "u2.json"]
+    remove_folder(folder)
+    assert files_below(folder) == []
+
+
+def test_a_source_is_fetched_once_and_again_when_it_changes(folder):
+    path = below(folder, "catalog.txt")
+    path.write_bytes(b"old")
+    first = local(path)
+    assert first.read_bytes() == b"old"
+    assert local(path) == first
+    before = state_of(path)
+    time.sleep(1.1)
+    path.write_bytes(b"new")
+    assert local(path).read_bytes() == b"new"
+    assert state_of(path) != before
+
+
+def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(folder):
+    with locked(folder):
+        assert in_use(folder)
+        held = json.loads((folder / ".lock").read_bytes())
+        (folder / ".lock").write_text(json.dumps(held | {"pid": os.getppid()}))
+        with pytest.raises(UserError, match="in use by another driver"), locked(folder):
+            pass
+        (folder / ".lock").write_text(json.dumps(held | {"pid": 2**22 + 1}))
+        with locked(folder):
+            assert in_use(folder)
+    assert not in_use(folder)
+
+
+def test_a_log_goes_out_in_parts(folder):
+    log = Log(folder / "log")
+    log.write("run", pipeline="x")
+    for k in range(5):
+        log.write("unit", unit=f"u{k}")
+    assert [one["event"] for one in events(folder / "log", log.name)] == ["run"]
+    log.write("end", how="done")
+    assert runs(folder / "log") == [log.name]
+    assert [one["event"] for one in events(folder / "log", log.name)] == ["run", *["unit"] * 5, "end"]
+    assert newest_event(folder / "log")["how"] == "done"
+
+
+@pytest.mark.parametrize("where", ["bucket", "folder"])
+def test_images_come_back_and_a_chunk_that_is_gone_is_an_error(where, folder, tmp_path):
+    store = Store(folder if where == "bucket" else tmp_path)
+    product = images(3).stored(store)
+    product.prepare(store)
+    made = product.write(1, store)
+    assert product.verify(1, store) == made.output
+    np.testing.assert_array_equal(product.reader(1)("image"), images(3).make(1)["image"])
+    with pytest.raises(UserError, match=r"image is damaged \(.*the chunk is gone\): romandask verify --forget"):
+        product.reader(2)("image")
+
+
+def test_a_survey_in_a_bucket_is_read_and_verified_as_one_in_a_folder(survey, tiny_store):
+    here, there = romandask.open(tiny_store), romandask.open(survey)
+    assert repr(there).replace(survey, str(tiny_store)) == repr(here)
+    window = {"tile": 0, "y": slice(100, 140), "x": slice(100, 140)}
+    for one in ("roman", "rubin"):
+        first, second = (s.coadds(one)["image"].isel(window).compute() for s in (here, there))
+        np.testing.assert_array_equal(first, second)
+    pd.testing.assert_frame_equal(here.objects("roman").compute(), there.objects("roman").compute())
+    catalog = pd.read_parquet(f"{survey}/objects/roman/catalog/dataset", columns=["objectId"])
+    assert len(catalog) == len(here.objects("roman"))
+    done = command("verify", survey)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "units are as they were written" in done.stdout
+
+
+def test_what_is_damaged_in_a_bucket_is_found_and_made_again_to_the_byte(survey, tiny_store, tmp_path):
+    there = place_of(survey)
+    chunk = next(path for path in files_below(there / "coadds/rubin.zarr/image") if path.name != "zarr.json")
+    table = next(path for path in files_below(there / "objects/roman/catalog/dataset") if path.name.startswith("Npix"))
+    content = table.read_bytes()
+    table.write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
+    chunk.unlink()
+    done = command("verify", survey, "--forget")
+    assert done.returncode == 1
+    assert "damaged: coadds/rubin/" in done.stdout
+    assert "damaged: objects/roman/" in done.stdout
+    again = command("run", "tiny", "--store", survey, "--workers", "1", cwd=tmp_path)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert table.read_bytes() == content
+    found, expected = (
+        {(stage, name): record.output for stage in store.stages() for name, record in read_records(store, stage)}
+        for store in (Store(there), Store(tiny_store))
+    )
+    assert found == expected
+    assert (there / "report/index.html").read_bytes().startswith(b"<!doctype html>")
+    assert "it ended (done)" in command("status", survey).stdout
+
+
+def test_a_pipeline_and_its_sources_are_read_from_a_bucket(bucket, shared, tmp_path):
+    source = shared / "skycatalogs_sample"
+    upload(source, f"{bucket}/sky")
+    counts = []
+    for where, store in ((str(source), tmp_path / "here"), (f"{bucket}/sky", tmp_path / "there")):
+        done = command("ingest", "skycatalogs", where, "--store", str(store), "--seds", str(shared / "seds"))
+        assert done.returncode == 0, done.stdout + done.stderr
+        counts.append(done.stdout.splitlines()[-1])
+    assert counts[0] == counts[1]
+    assert "rows in" in counts[0]
+    (place_of(bucket) / "p.yaml").write_text(
+        "name: p\nseed: 1\nregion: {ra: [53, 53.01], dec: [-40, -39.99]}\nroman: {}\n"
+    )
+    assert command("plan", f"{bucket}/p.yaml").returncode == 0
+
+
+def test_every_kind_of_source_reads_the_same_from_a_bucket(bucket, shared):
+    upload(shared / "dc2_instance_catalog", f"{bucket}/dc2")
+    for name in ("opsim", "roman_obseq"):
+        upload(shared / name, f"{bucket}/{name}")
+    for read, name in (
+        (opsim.read, sorted((shared / "opsim").glob("*.db"))[0]),
+        (obseq.read, sorted((shared / "roman_obseq").glob("*.fits"))[0]),
+    ):
+        pd.testing.assert_frame_equal(read(place_of(f"{bucket}/{name.relative_to(shared)}")), read(name))
+    name = next(
+        path.name for path in sorted((shared / "dc2_instance_catalog").iterdir()) if path.name.startswith("example")
+    )
+    here, there = (
+        instance_catalog.open_source(folder / name)
+        for folder in (shared / "dc2_instance_catalog", place_of(f"{bucket}/dc2"))
+    )
+    assert [batch.name for batch in here.batches()] == [batch.name for batch in there.batches()]
+    for first, second in zip(here.batches(), there.batches(), strict=True):
+        pd.testing.assert_frame_equal(here.read(first), there.read(second))
+
+
+def test_what_cannot_be_reached_is_told_in_one_line(bucket, monkeypatch):
+    cases = [
+        ("status", "s3://nobucket/tiny"),
+        ("run", "tiny", "--store", "s3://nobucket/tiny"),
+        ("plan", "s3://no/p.yaml"),
+    ]
+    for case in cases:
+        done = command(*case)
+        assert done.returncode == 2, done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert done.stderr.startswith("error: s3://no")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    done = command("status", f"{bucket}/tiny")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,193 @@
+"""The code's own rules: linter, types, layers, and prose that names real things."""
+
+import ast
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+import yaml
+from conftest import ROOT
+from typer.main import get_command
+
+from romandask.cli.main import app
+from romandask.report.reference import reference
+
+PACKAGE = ROOT / "romandask"
+TYPED = [f"romandask/{room}" for room in ("model", "storage", "products", "engine", "ingest", "cli")]
+ROOMS = (
+    "cli",
+    "report",
+    "export",
+    "run",
+    "stage_graph",
+    "survey",
+    "survey_products",
+    "stages",
+    "pipeline",
+    "ingest",
+    "instruments",
+    "engine",
+    "products",
+    "storage",
+    "kernels",
+    "model",
+)
+"""Folders and modules of the package, from the top: a module imports only from rooms below its own, or from its own."""
+KERNELS = ("measurement", "coadding", "rendering", "detectors", "universe")
+"""The same inside `kernels`."""
+NOT_YET = {"engine/run_stages.py", "engine/verify.py", "instruments/roman/sca_effects.py"}
+"""Modules that still import from above."""
+
+
+def imports_of(path: Path) -> list[str]:
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("romandask"):
+            found += [f"{node.module}.{name.name}" for name in node.names]
+        elif isinstance(node, ast.Import):
+            found += [name.name for name in node.names if name.name.startswith("romandask")]
+    return found
+
+
+def modules() -> list[Path]:
+    return [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent != PACKAGE or not path.name.startswith("__")]
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    own = path.relative_to(PACKAGE).with_suffix("").parts
+    if str(path.relative_to(PACKAGE)) in NOT_YET:
+        return
+    for module in imports_of(path):
+        other = module.split(".")[1:]
+        assert other[0] == own[0] or ROOMS.index(other[0]) > ROOMS.index(own[0]), f"{path} imports {module}"
+        if own[0] == other[0] == "kernels" and own[1] != other[1]:
+            assert KERNELS.index(other[1]) > KERNELS.index(own[1]), f"{path} imports {module}"
+
+
+def test_kernels_and_model_know_no_dask_zarr_or_files():
+    for path in [*(PACKAGE / "kernels").rglob("*.py"), *(PACKAGE / "model").glob("*.py")]:
+        text = path.read_text()
+        assert not re.search(r"^(import|from) (dask|distributed|zarr|xarray|pyarrow)", text, re.M), path
+
+
+def test_kernels_that_make_images_round_alike_wherever_their_arrays_lie():
+    """With fastmath the plain and the vectorised form of a loop differ, and addresses choose between them."""
+    for path in (PACKAGE / "kernels").rglob("*.py"):
+        assert "fastmath=True" not in path.read_text(), path
+
+
+def test_nothing_that_a_user_writes_can_become_code():
+    for path in modules():
+        found = re.findall(
+            r"pickle|\beval\(|\bexec\(|unsafe_load|shell=True|yaml\.(?:full_)?load\((?!text, _Loader\))",
+            path.read_text(),
+        )
+        assert not found, (path, found)
+
+
+def test_linear_algebra_has_one_thread_wherever_the_package_is():
+    """Its sums are rounded otherwise with more, and so are pixels: not by an environment that is set too late alone."""
+    code = "import numpy; import romandask, threadpoolctl, json; print(json.dumps(threadpoolctl.threadpool_info()))"
+    environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    pools = [pool for pool in json.loads(done.stdout) if pool["user_api"] == "blas"]
+    assert pools
+    assert {pool["num_threads"] for pool in pools} == {1}
+
+
+def test_one_module_alone_imports_distributed():
+    users = [
+        path.name
+        for path in PACKAGE.rglob("*.py")
+        if re.search(r"^\s*(import|from) distributed", path.read_text(), re.M)
+    ]
+    assert users == ["clients.py"]
+
+
+def test_modules_read_alone():
+    for path in PACKAGE.rglob("*.py"):
+        assert len(path.read_text().splitlines()) <= 450, path
+        assert ast.get_docstring(ast.parse(path.read_text())), path
+
+
+def test_ruff_finds_nothing():
+    done = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_formatter_changes_nothing():
+    done = subprocess.run(
+        [sys.executable, "-m", "ruff", "format", "--check", "."], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_types_hold():
+    command = [sys.executable, "-m", "mypy", *TYPED]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+PAGES = (
+    "README.md",
+    "pipelines/README.md",
+    "pipelines/GUIDE.md",
+    "catalogs/README.md",
+    "romandask/instruments/README.md",
+)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_path_and_command_that_a_page_names_exists(page, tmp_path, monkeypatch):
+    text = (ROOT / page).read_text()
+    for path in re.findall(r"`((?:romandask|pipelines|catalogs|tests)/[\w./-]*)`", text):
+        assert (ROOT / path).exists(), path
+    monkeypatch.chdir(tmp_path)
+    for block in re.findall(r"```bash\n(.*?)```", text, re.S):
+        for line in block.splitlines():
+            if not line.startswith("romandask "):
+                continue
+            command, words = get_command(app), shlex.split(line, comments=True)[1:]
+            while isinstance(command, click.Group):
+                assert words[0] in command.commands, line
+                command, words = command.commands[words[0]], words[1:]
+            # what is read, options and their values, nothing is done
+            command.make_context("romandask", words)
+
+
+def test_the_python_of_the_guide_runs(tiny_store, tmp_path):
+    (tmp_path / "runs").symlink_to(tiny_store.parent)
+    text = (ROOT / "pipelines" / "GUIDE.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.S))
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "truth/structure" in done.stdout, "the survey's repr"
+
+
+def test_the_reference_of_products_is_what_the_code_makes():
+    """romandask reference > catalogs/REFERENCE.md writes it anew."""
+    assert (ROOT / "catalogs" / "REFERENCE.md").read_text() == reference()
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    run, test = (block.strip().splitlines()[0] for block in blocks[:2])
+    assert "romandask run pipelines/tiny.yaml --store runs/tiny" in run
+    assert test in (ROOT / ".ci" / "run").read_text()
+
+
+def test_every_catalog_column_is_described():
+    for path in (ROOT / "catalogs").glob("*.yaml"):
+        content = yaml.safe_load(path.read_text())
+        assert {"description", "key", "partitioning", "columns"} <= set(content), path
+        for column in content["columns"]:
+            assert {"name", "dtype", "unit", "ucd", "description"} <= set(column), (path, column)

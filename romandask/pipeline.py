@@ -29,7 +29,7 @@ from romandask.model.settings import (
     read_yaml,
     validate,
 )
-from romandask.storage.paths import Place, below, place_of, reached
+from romandask.storage.paths import AnyPath, access_errors_explained, parse_path, resolve_below
 
 
 class Pipeline(Section):
@@ -71,14 +71,14 @@ class Pipeline(Section):
         if self.roman is None or self.roman.detector == "simple":
             return None
         folder = self.roman.calibration
-        return CalibrationSource(None if folder is None else below(place_of(self.data), folder), self.seed)
+        return CalibrationSource(None if folder is None else resolve_below(parse_path(self.data), folder), self.seed)
 
     def to_yaml(self) -> str:
         """Return the resolved settings as YAML."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
 
 
-def load_pipeline(source: str | Place, overrides: list[str] | None = None) -> Pipeline:
+def load_pipeline(source: str | AnyPath, overrides: list[str] | None = None) -> Pipeline:
     """Return the settings of a YAML file, or of a pipeline that came with the package, with overrides applied.
 
     Raises
@@ -87,11 +87,11 @@ def load_pipeline(source: str | Place, overrides: list[str] | None = None) -> Pi
         Naming the file and every key that is unknown (with the nearest valid one), missing or wrong.
     """
     found = _find(source)
-    with reached(found):
+    with access_errors_explained(found):
         content = apply_overrides(read_yaml(found), overrides or [])
     settings: Pipeline = validate(Pipeline, content, str(source))
     # workers, and whoever opens the store later, need not share this working directory
-    return settings.model_copy(update={"data": str(place_of(settings.data, "data"))})
+    return settings.model_copy(update={"data": str(parse_path(settings.data, "data"))})
 
 
 def pipeline_of(content: dict[str, Any], source: str) -> Pipeline:
@@ -104,9 +104,9 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in resource_folder("pipelines").glob("*.yaml"))
 
 
-def _find(source: str | Place) -> Place:
+def _find(source: str | AnyPath) -> AnyPath:
     if "://" in str(source):
-        return place_of(source, "a pipeline")
+        return parse_path(source, "a pipeline")
     path = Path(str(source))
     if path.is_file():
         return path

@@ -14,15 +14,15 @@ from rich.console import Console
 from romandask.engine.clients import Client, Runner, on_client
 from romandask.engine.event_log import Log, newest_event
 from romandask.engine.progress import Reporter
-from romandask.engine.run_stages import Run, Summary, make
-from romandask.engine.staleness import failed, pending
+from romandask.engine.run_stages import Run, Summary, run_stages
+from romandask.engine.staleness import failed, find_stale
 from romandask.pipeline import Pipeline
 from romandask.stage_graph import Chosen, plan, stages, tier
 from romandask.stages.truth.ingested import source_rows
-from romandask.storage.checksums import seal
+from romandask.storage.checksums import write_checksums
 from romandask.storage.lock import locked
 from romandask.storage.manifest import read_record, read_records
-from romandask.storage.paths import Place, place_of, write_bytes
+from romandask.storage.paths import AnyPath, parse_path, write_bytes
 from romandask.storage.store import Store, write_json
 from romandask.survey import Survey
 
@@ -73,11 +73,11 @@ def run(
     retry : make again what failed in an earlier run; else it stays aside until something that it depends on changes
     """
     with _running(pipeline, store, runner, reporter, retry) as this:
-        make((chosen or Chosen()).of(stages(this.survey)), this)
+        run_stages((chosen or Chosen()).of(stages(this.survey)), this)
     return this.summary
 
 
-def run_on(client: Client, pipeline: Pipeline, store: Place | str, chosen: Chosen | None = None) -> Summary:
+def run_on(client: Client, pipeline: Pipeline, store: AnyPath | str, chosen: Chosen | None = None) -> Summary:
     """Make and store what is missing, as `romandask run` does, on the cluster that a dask client is connected to.
 
     Parameters
@@ -97,7 +97,7 @@ def run_on(client: Client, pipeline: Pipeline, store: Place | str, chosen: Chose
         If settings or store are not what they should be, or the cluster's workers too small or of another version.
     """
     plan(Survey(pipeline))
-    place = Store(place_of(store))
+    place = Store(parse_path(store))
     runner = on_client(client, pipeline.run.memory_limit)
     place.prepare()
     return run(pipeline, place, runner, Reporter(Console()), chosen)
@@ -113,7 +113,7 @@ def explain(survey: Survey, chosen: Chosen | None = None, retry: bool = False) -
     rows = []
     for stage in (chosen or Chosen()).of(stages(survey)):
         product = stage.product(survey)
-        todo = pending(product, store, coming, retry)
+        todo = find_stale(product, store, coming, retry)
         coming |= {(product.stage, product.names[task.index]) for task in todo.tasks}
         reasons = Counter(task.why for task in todo.tasks)
         reasons += Counter({"an input is missing": len(todo.blocked), "set aside, it failed": len(todo.aside)})
@@ -131,11 +131,11 @@ def ingest(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporter)
     """
     with _running(pipeline, store, runner, reporter, retry=True) as this:
         survey, summary = this.survey, this.summary
-        make([stage for stage in stages(survey) if stage.name.startswith("truth/")], this)
+        run_stages([stage for stage in stages(survey) if stage.name.startswith("truth/")], this)
     catalogs = survey.truth_catalogs
     out = sum(int(product.column("n_rows").sum()) for product in (catalogs.galaxies, catalogs.stars))
     aside = {row["stage"]: row["rows"] for row in run_figures(store)}.get("truth/quarantine", 0)
-    counts = {"in": source_rows(survey.incoming_product), "out": out, "quarantined": aside}
+    counts = {"in": source_rows(survey.ingested_product), "out": out, "quarantined": aside}
     if summary.failed or counts["in"] != counts["out"] + counts["quarantined"]:
         raise RuntimeError(f"rows are missing: {counts}; failed units: {summary.failed}")
     return counts
@@ -148,7 +148,7 @@ def _running(pipeline: Pipeline, store: Store, runner: Runner, reporter: Reporte
         versions = {name: version(name) for name in PACKAGES}
         write_bytes(store.pipeline, pipeline.to_yaml().encode())
         write_json(store.root / "versions.json", versions)
-        seal(store, "store", [store.pipeline, store.root / "versions.json"])
+        write_checksums(store, "store", [store.pipeline, store.root / "versions.json"])
         this = Run(Survey(pipeline, store), store, runner, reporter, Log(store.log), retry)
         this.log.write("run", pipeline=pipeline.name, on=runner.description, versions=versions)
         end = "stopped"

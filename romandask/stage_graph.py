@@ -59,7 +59,7 @@ def tier(stage: str) -> int:
     What they leave tells which units it has: source rows (0) those of truth and pointings (1), these those of all
     others (2).
     """
-    if stage == "truth/incoming":
+    if stage == "truth/ingested":
         return 0
     return 1 if stage.startswith(("truth/", "pointings/")) else 2
 
@@ -165,7 +165,7 @@ def stages(survey: Survey) -> list[Stage]:
 def _first(survey: Survey) -> Stage:
     if survey.pipeline.truth.source == "generate":
         return Stage("truth/structure", lambda s: s.truth_catalogs.structure)
-    return Stage("truth/incoming", lambda s: s.incoming_product)
+    return Stage("truth/ingested", lambda s: s.ingested_product)
 
 
 def _with_margin(name: str, product: Callable[[Survey], TableProduct], position: tuple[str, str]) -> list[Stage]:

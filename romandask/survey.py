@@ -23,7 +23,7 @@ from romandask.stages.detections.truth_match import completeness, reference_band
 from romandask.stages.detections.zero_points import FLUXES
 from romandask.stages.pointings import visits
 from romandask.storage.manifest import read_records
-from romandask.storage.paths import Place, place_of, reached
+from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 from romandask.storage.store import Store
 from romandask.survey_products import SurveyProducts
 
@@ -266,7 +266,7 @@ def _with_group(groups: pd.DataFrame, merged: pd.DataFrame, length: float) -> pd
     return groups.assign(group=group_of(groups, merged, length))
 
 
-def open_survey(path: str | Place) -> Survey:
+def open_survey(path: str | AnyPath) -> Survey:
     """Open a stored survey: its folder, or s3://BUCKET/FOLDER.
 
     Raises
@@ -274,8 +274,8 @@ def open_survey(path: str | Place) -> Survey:
     UserError
         If it is not a store, or cannot be reached.
     """
-    store = Store(place_of(path))
-    with reached(store.root):
+    store = Store(parse_path(path))
+    with access_errors_explained(store.root):
         there = store.pipeline.is_file()
     if not there:
         raise UserError(f"{path}: not a romandask store (it has no pipeline.yaml); make one with romandask run")

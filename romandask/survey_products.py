@@ -32,10 +32,10 @@ from romandask.stages.exposures import exposures
 from romandask.stages.pointings import pointings
 from romandask.stages.psf_images import psfs
 from romandask.stages.truth.catalogs import TruthCatalogs, truth
-from romandask.stages.truth.ingested import incoming, open_sources
+from romandask.stages.truth.ingested import ingested_rows, open_sources
 from romandask.stages.truth_index import truth_index
 from romandask.storage.manifest import read_record
-from romandask.storage.paths import Place, below, place_of, state_of
+from romandask.storage.paths import AnyPath, file_state, parse_path, resolve_below
 from romandask.storage.store import Store, read_parquet
 
 
@@ -76,20 +76,20 @@ class SurveyProducts:
         }
 
     @property
-    def data(self) -> Place:
+    def data(self) -> AnyPath:
         """The folder that source files are below."""
-        return place_of(self.pipeline.data, "data")
+        return parse_path(self.pipeline.data, "data")
 
     @cached_property
-    def incoming_product(self) -> TableProduct:
+    def ingested_product(self) -> TableProduct:
         """The rows of the source catalogs, where truth is not generated."""
-        return self._stored(incoming(open_sources(self.pipeline.truth, self.data)))
+        return self._stored(ingested_rows(open_sources(self.pipeline.truth, self.data)))
 
     @cached_property
     def truth_catalogs(self) -> TruthCatalogs:
         """The truth catalogs."""
         settings = self.pipeline
-        rows = None if settings.truth.source == "generate" else self.incoming_product
+        rows = None if settings.truth.source == "generate" else self.ingested_product
         return truth(settings.truth, self.data, self.region, self.bandpasses, settings.seed, self.store, rows)
 
     def pointing_product(self, survey: str) -> TableProduct:
@@ -291,9 +291,9 @@ class _MakePointings:
         return SurveyProducts(self._pipeline).make_pointings(self._name)
 
 
-def _state(data: Place, path: str | None):
+def _state(data: AnyPath, path: str | None):
     """Return what identifies the content of a source file without reading it."""
     if path is None:
         return None
-    file = below(data, path)
-    return (path, *state_of(file)) if file.is_file() else (path,)
+    file = resolve_below(data, path)
+    return (path, *file_state(file)) if file.is_file() else (path,)

@@ -20,7 +20,7 @@ from romandask.instruments.roman.focal_plane import SCAS
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
 from romandask.pipeline import load_pipeline
-from romandask.report.sky_viewer import export_atlas
+from romandask.report.sky_viewer import write_sky_viewer
 from romandask.survey import Survey, open_survey
 
 export_app = typer.Typer(no_args_is_help=True)
@@ -105,7 +105,7 @@ def export_asdf_images(
 @export_app.command("page")
 def export_page(store: StoreArgument, out: Folder) -> None:
     """Write the coadds as one page to drag and zoom in, both telescopes at the same place: OUT/index.html."""
-    path = export_atlas(open_survey(store), out)
+    path = write_sky_viewer(open_survey(store), out)
     Console().print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

@@ -14,7 +14,7 @@ from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
 from romandask.model.settings import read_yaml
 from romandask.pipeline import pipeline_of
-from romandask.storage.paths import Place, below
+from romandask.storage.paths import AnyPath, resolve_below
 from romandask.storage.store import Store
 from romandask.survey import Survey
 
@@ -73,7 +73,7 @@ def table(
     for section, key in (("galaxies", "galaxy_table"), ("stars", "star_table")):
         if isinstance(sections.get(section), dict) and "path" in sections[section]:
             # as the map's author sees it
-            path = below(columns.parent, str(sections[section]["path"]))
+            path = resolve_below(columns.parent, str(sections[section]["path"]))
             content[key] = sections[section] | {"path": str(path)}
         elif section in sections:
             raise UserError(f"{columns}: section {section} must hold path and columns")
@@ -81,7 +81,7 @@ def table(
 
 
 def _ingest(
-    source: Place, truth: dict[str, Any], store: Place, seds: Place | None, order: int, workers: int | None
+    source: AnyPath, truth: dict[str, Any], store: AnyPath, seds: AnyPath | None, order: int, workers: int | None
 ) -> None:
     content = {
         "name": "ingest",
@@ -94,7 +94,7 @@ def _ingest(
     settings = pipeline_of(content, str(source))
     place = Store(store)
     survey = Survey(settings)
-    survey.incoming_product  # noqa: B018  opened, so that a wrong source is known before anything is written
+    survey.ingested_product  # noqa: B018  opened, so that a wrong source is known before anything is written
     place.prepare()
     reporter = Reporter(Console())
     with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:

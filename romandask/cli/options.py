@@ -9,12 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from romandask.storage.paths import Place, place_of
+from romandask.storage.paths import AnyPath, parse_path
 
 
-def source_place(text: str) -> Place:
+def source_place(text: str) -> AnyPath:
     """Return the place of something that is read."""
-    return place_of(text, "a source")
+    return parse_path(text, "a source")
 
 
 Source = Annotated[
@@ -24,14 +24,15 @@ Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
 ]
 StoreOption = Annotated[
-    Any, typer.Option("--store", metavar="FOLDER", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+    Any,
+    typer.Option("--store", metavar="FOLDER", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER."),
 ]
 Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
 ]
 StoreArgument = Annotated[
-    Any, typer.Argument(metavar="STORE", parser=place_of, help="Folder of the store, or s3://BUCKET/FOLDER.")
+    Any, typer.Argument(metavar="STORE", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER.")
 ]
 Spectra = Annotated[
     Any,

@@ -23,12 +23,12 @@ import dask
 import yaml
 from distributed import Client, LocalCluster, performance_report
 
-from romandask.engine.submission import Wave, hand_out
+from romandask.engine.submission import Submission, submit_units
 from romandask.engine.task import Batch, Outcome, given_up, make_unit
-from romandask.engine.task_queue import Waiting
+from romandask.engine.task_queue import TaskQueue
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
-from romandask.storage.paths import Place, write_bytes
+from romandask.storage.paths import AnyPath, write_bytes
 
 STARTS = 3
 """Times that local workers are started before a run gives up."""
@@ -56,7 +56,7 @@ class Runner(Protocol):
             there is nothing
         """
 
-    def recording(self, path: Place) -> AbstractContextManager[Any]:
+    def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
         """Write, at the end of the context, a page with what the cluster did in it."""
 
 
@@ -65,7 +65,7 @@ class InProcess:
 
     description = "in this process"
 
-    def recording(self, path: Place) -> AbstractContextManager[Any]:
+    def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
         """Write nothing: there is no cluster."""
         return nullcontext()
 
@@ -82,7 +82,7 @@ class InProcess:
 
 
 def _one_by_one(batch: Batch) -> Iterator[Outcome]:
-    product, waiting = batch.product, Waiting([replace(task, cost=0.0) for task in batch.tasks])
+    product, waiting = batch.product, TaskQueue([replace(task, cost=0.0) for task in batch.tasks])
     while waiting:
         task = waiting.next()
         try:
@@ -100,7 +100,7 @@ class OnCluster:
         self._restart = restart or (lambda: None)
         self.description = description
 
-    def recording(self, path: Place) -> AbstractContextManager[Any]:
+    def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
         """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
         return _recording(self._client, path)
 
@@ -113,16 +113,16 @@ class OnCluster:
             If for a minute there is no worker.
         """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        waves = [Wave(self._client, batch, ended.put) for batch in begin]
+        waves = [Submission(self._client, batch, ended.put) for batch in begin]
         seen = time.monotonic()
         try:
             while True:
                 # as long as there are more they are asked for; in between workers get what they can do
-                new = [Wave(self._client, batch, ended.put) for batch in more()]
+                new = [Submission(self._client, batch, ended.put) for batch in more()]
                 waves = sorted(filter(None, [*waves, *new]), key=lambda wave: wave.batch.rank)
                 threads = self._threads()
                 seen = time.monotonic() if threads else seen
-                hand_out(waves, threads)
+                submit_units(waves, threads)
                 if not waves and not new:
                     return
                 future = self._next(ended, 0.0 if new else 2.0)
@@ -152,7 +152,7 @@ class OnCluster:
 
 
 @contextmanager
-def _recording(client: Client, path: Place) -> Iterator[None]:
+def _recording(client: Client, path: AnyPath) -> Iterator[None]:
     # one page without external assets, written whole
     with TemporaryDirectory(prefix="romandask-") as folder:
         temporary = Path(folder) / "performance.html"

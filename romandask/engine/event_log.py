@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from romandask.storage.paths import Place, names_in, write_bytes
+from romandask.storage.paths import AnyPath, file_names, write_bytes
 
 ENDING = ".jsonl"
 EVERY = 10.0
@@ -23,7 +23,7 @@ class Log:
     every few seconds.
     """
 
-    def __init__(self, folder: Place):
+    def __init__(self, folder: AnyPath):
         self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"
         self._folder = folder
         self._lines: list[str] = []
@@ -31,7 +31,7 @@ class Log:
         if isinstance(folder, Path):
             folder.mkdir(parents=True, exist_ok=True)
 
-    def beside(self, ending: str) -> Place:
+    def beside(self, ending: str) -> AnyPath:
         """Return the file of the log's name with another ending."""
         return self._folder / f"{self.name}{ending}"
 
@@ -54,14 +54,14 @@ class Log:
         self._written = time.monotonic()
 
 
-def runs(folder: Place) -> list[str]:
+def runs(folder: AnyPath) -> list[str]:
     """Return the names of the logs of a store, in the order of their runs."""
-    return sorted({name.split("-")[0] for name in names_in(folder, ENDING)})
+    return sorted({name.split("-")[0] for name in file_names(folder, ENDING)})
 
 
-def events(folder: Place, run: str) -> Iterator[dict[str, Any]]:
+def events(folder: AnyPath, run: str) -> Iterator[dict[str, Any]]:
     """Yield the events of a log; a last line that was cut is left out."""
-    for name in names_in(folder, ENDING):
+    for name in file_names(folder, ENDING):
         if name.split("-")[0] != run:
             continue
         for line in (folder / f"{name}{ENDING}").read_text(encoding="utf-8").splitlines():
@@ -71,7 +71,7 @@ def events(folder: Place, run: str) -> Iterator[dict[str, Any]]:
                 return
 
 
-def newest_event(folder: Place) -> dict[str, Any] | None:
+def newest_event(folder: AnyPath) -> dict[str, Any] | None:
     """Return what happened last in the newest run; None where no run has a log."""
     found = runs(folder)
     last = None

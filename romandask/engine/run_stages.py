@@ -9,13 +9,19 @@ from dataclasses import dataclass, field
 from romandask.engine.clients import Runner
 from romandask.engine.event_log import Log
 from romandask.engine.progress import Board, Meter, Reporter
-from romandask.engine.staleness import Pending, drop_strays, pending, write_failure
+from romandask.engine.staleness import Staleness, find_stale, remove_stray_records, write_failure
 from romandask.engine.task import Batch, Outcome, Task
 from romandask.products.hats import write_catalog_files
 from romandask.products.images import ImageProduct
 from romandask.stage_graph import Product, Stage, reads, tier
 from romandask.stages.truth.catalogs import write_spectra
-from romandask.storage.checksums import catalog_files, image_files, seal, sealed, unseal
+from romandask.storage.checksums import (
+    catalog_metadata_files,
+    has_checksums,
+    image_metadata_files,
+    remove_checksums,
+    write_checksums,
+)
 from romandask.storage.paths import files_below
 from romandask.storage.store import Store, refuse_full
 from romandask.survey import Survey
@@ -50,7 +56,7 @@ class Run:
     """What is to be closed at the end."""
 
 
-def make(stages: list[Stage], this: Run) -> None:
+def run_stages(stages: list[Stage], this: Run) -> None:
     """Make and store the units of some stages that are missing or no longer what they should be.
 
     A stage that fails in part is no hindrance: units that need what is not there wait, and are told of.
@@ -61,7 +67,7 @@ def make(stages: list[Stage], this: Run) -> None:
         If the store can take no more: that is no unit's fault, and every other would fail too.
     """
     with this.reporter.board() as board:
-        course = _Course(stages, this, board)
+        course = _StageRun(stages, this, board)
         with closing(this.runner.run(more=course.ready)) as outcomes:
             for outcome in outcomes:
                 course.take(outcome)
@@ -70,7 +76,7 @@ def make(stages: list[Stage], this: Run) -> None:
 
 
 @dataclass
-class _Going:
+class _Active:
     """A stage that is under way."""
 
     stage: Stage
@@ -80,14 +86,14 @@ class _Going:
     meter: Meter
 
 
-class _Course:
+class _StageRun:
     """The stages of a run: those to come, those under way, and what begins and ends them."""
 
     def __init__(self, stages: list[Stage], this: Run, board: Board):
         self._this, self._board = this, board
         self._ranks = {stage.name: rank for rank, stage in enumerate(stages)}
         self._coming = {stage.name: stage for stage in stages}
-        self._going: dict[str, _Going] = {}
+        self._going: dict[str, _Active] = {}
         self._reads: dict[str, frozenset[str]] = {}
         self._changed = True
 
@@ -153,18 +159,18 @@ class _Course:
             self._reads[stage.name] = reads(stage.product(self._this.survey)) - {stage.name}
         return self._reads[stage.name]
 
-    def _begin(self, stage: Stage) -> _Going | None:
+    def _begin(self, stage: Stage) -> _Active | None:
         """Find what there is to do of a stage; None where it is nothing, and the stage has ended."""
         this = self._this
         with this.reporter.busy(f"{stage.name}: finding what there is to do"):
             product = stage.product(this.survey)
-            todo = pending(product, this.store, retry=this.retry)
+            todo = find_stale(product, this.store, retry=this.retry)
         self._tell(stage.name, todo)
-        drop_strays(product, this.store, {product.names[task.index] for task in todo.tasks})
+        remove_stray_records(product, this.store, {product.names[task.index] for task in todo.tasks})
         if not todo.tasks:
             self._end(stage, product)
             return None
-        unseal(this.store, stage.name)
+        remove_checksums(this.store, stage.name)
         product.prepare(this.store)
         if not this.summary.begun:
             this.ends.enter_context(this.runner.recording(this.log.beside(".html")))
@@ -172,11 +178,11 @@ class _Course:
         this.log.write("stage", stage=stage.name, make=len(todo.tasks), keep=todo.kept, blocked=len(todo.blocked))
         meter = self._board.begin(stage.name, len(todo.tasks), sum(task.cost for task in todo.tasks))
         # a unit that is made again reads its upstream from the store, never its own former self
-        going = _Going(stage, product, {task.index: task for task in todo.tasks}, meter)
+        going = _Active(stage, product, {task.index: task for task in todo.tasks}, meter)
         self._going[stage.name] = going
         return going
 
-    def _tell(self, stage: str, todo: Pending) -> None:
+    def _tell(self, stage: str, todo: Staleness) -> None:
         summary = self._this.summary
         summary.made[stage], summary.kept[stage] = 0, todo.kept
         summary.failed += [f"{stage}/{name} (an input is missing)" for name in todo.blocked]
@@ -186,13 +192,15 @@ class _Course:
         """Write what a stage has but its units: the files of a catalog, spectra, checksums."""
         store = self._this.store
         # what an earlier run left unsealed it did not end
-        anew = self._this.summary.made[stage.name] or not sealed(store, stage.name)
+        anew = self._this.summary.made[stage.name] or not has_checksums(store, stage.name)
         if anew or (stage.position is not None and not (store.catalog(stage.name) / "hats.properties").exists()):
             if isinstance(product, ImageProduct):
-                seal(store, stage.name, image_files(store, stage.name, [v.name for v in product.variables]))
+                write_checksums(
+                    store, stage.name, image_metadata_files(store, stage.name, [v.name for v in product.variables])
+                )
             elif stage.position is not None:
                 write_catalog_files(product, store, *stage.position)
-                seal(store, stage.name, catalog_files(store, stage.name))
+                write_checksums(store, stage.name, catalog_metadata_files(store, stage.name))
         if stage.name == "truth/galaxies":
             write_spectra(self._this.survey.truth_catalogs, store)
-            seal(store, "truth/seds", files_below(store.images("truth/seds")))
+            write_checksums(store, "truth/seds", files_below(store.images("truth/seds")))

@@ -11,16 +11,16 @@ from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.storage.manifest import Record, digest, read_records
-from romandask.storage.paths import Place, contents, names_in, remove, write_bytes
+from romandask.storage.paths import AnyPath, file_names, read_files, remove, write_bytes
 from romandask.storage.store import Store
 
-AGAIN = "failed before"
+FAILED_BEFORE = "failed before"
 FAILED = ".failed"
 """Ending of the files that say why a unit failed."""
 
 
 @dataclass(frozen=True)
-class Pending:
+class Staleness:
     """The units of a stage by what is to be done with them."""
 
     tasks: list[Task]
@@ -32,12 +32,12 @@ class Pending:
     """Units that failed, with inputs that have not changed since."""
 
 
-def pending(
+def find_stale(
     product: ImageProduct | TableProduct,
     store: Store,
     coming: Set[tuple[str, str]] | None = None,
     retry: bool = False,
-) -> Pending:
+) -> Staleness:
     """Return what is to be done; the records of units that are to be made, or cannot be, are removed, but in a plan.
 
     Parameters
@@ -77,18 +77,18 @@ def pending(
         if again and not retry:
             aside.append(unit.name)
             continue
-        why = AGAIN if again else _why(unit.name, records, parts)
+        why = FAILED_BEFORE if again else _why(unit.name, records, parts)
         if forget and unit.name in records:
             remove(store.record(product.stage, unit.name))
-        tasks[unit.name] = Task(index, inputs, unit.cost, unit.kin, parts=parts, why=why)
-        waiting[unit.name] = unit.after
+        tasks[unit.name] = Task(index, inputs, unit.cost, unit.affinity, parts=parts, why=why)
+        waiting[unit.name] = unit.prerequisites
     held = _held(waiting, {*blocked, *aside})
     chosen = [
-        replace(task, after=tuple(tasks[other].index for other in waiting[name] if other in tasks))
+        replace(task, prerequisites=tuple(tasks[other].index for other in waiting[name] if other in tasks))
         for name, task in tasks.items()
         if name not in held
     ]
-    return Pending(chosen, kept, blocked + sorted(held), aside)
+    return Staleness(chosen, kept, blocked + sorted(held), aside)
 
 
 def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
@@ -122,7 +122,7 @@ def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
     return held
 
 
-def drop_strays(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
+def remove_stray_records(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
     """Remove the records of units that a stage no longer has, and the failures of those and of what is `made` now."""
     names = set(product.names)
     for name in store.recorded(product.stage):
@@ -135,12 +135,12 @@ def drop_strays(product: ImageProduct | TableProduct, store: Store, made: Set[st
 
 def failed(store: Store, stage: str) -> list[str]:
     """Return the units of a stage that failed."""
-    return names_in(store.records(stage), FAILED)
+    return file_names(store.records(stage), FAILED)
 
 
 def failures(store: Store, stage: str) -> dict[str, str]:
     """Return the units of a stage that failed, each with the hash of what it depended on then."""
-    found = contents(store.records(stage), FAILED)
+    found = read_files(store.records(stage), FAILED)
     return {name: text.split(b"\n", 1)[0].decode(errors="replace").removeprefix("inputs ") for name, text in found}
 
 
@@ -149,5 +149,5 @@ def write_failure(store: Store, stage: str, unit: str, inputs: str, text: str) -
     write_bytes(_failure(store, stage, unit), f"inputs {inputs}\n{text}".encode())
 
 
-def _failure(store: Store, stage: str, unit: str) -> Place:
+def _failure(store: Store, stage: str, unit: str) -> AnyPath:
     return store.records(stage) / f"{unit}{FAILED}"

@@ -11,21 +11,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from romandask.engine.task import Batch, Outcome, Task, after_failed, given_up, make_unit
-from romandask.engine.task_queue import Waiting
+from romandask.engine.task_queue import TaskQueue
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 
 ATTEMPTS = 3
 """A unit that fails this often is set aside."""
-WAVE = 4
+IN_FLIGHT_PER_THREAD = 4
 """Units in flight a thread of a worker: enough to keep it busy, few enough that nothing piles up."""
-LONG = 5.0
+LONG_UNIT_SECONDS = 5.0
 """Seconds: longer units are given out one a thread, to those that are free. One that waits behind another on its
 worker stays there, for dask moves only units of a kind that it has timed, and others would end with nothing to do."""
 
 
 @dataclass(frozen=True)
-class Flown:
+class InFlight:
     """A unit that has been handed out."""
 
     task: Task
@@ -33,14 +33,14 @@ class Flown:
     """The worker that it was meant for; None for any."""
 
 
-class Wave:
+class Submission:
     """The units of a batch: those that wait, those in flight, and what becomes of them."""
 
     def __init__(self, client: Any, batch: Batch, ended: Callable[[Any], None]):
         self.batch = batch
-        self.waiting = Waiting(batch.tasks)
-        self.long = batch.product.seconds_per_unit > LONG
-        self.flown: dict[Any, Flown] = {}
+        self.waiting = TaskQueue(batch.tasks)
+        self.long = batch.product.seconds_per_unit > LONG_UNIT_SECONDS
+        self.flown: dict[Any, InFlight] = {}
         """Units in flight by their future."""
         self._client, self._ended = client, ended
         self._flying: dict[int, Any] = {}
@@ -60,17 +60,17 @@ class Wave:
 
     def held(self, task: Task) -> bool:
         """True where a task waits for another in flight."""
-        return any(index in self._flying for index in task.after)
+        return any(index in self._flying for index in task.prerequisites)
 
-    def submit(self, place: str | None = None) -> Flown:
+    def submit(self, place: str | None = None) -> InFlight:
         """Hand out the next unit, to a worker or to any."""
         product = self.batch.product
-        busy = {one.task.kin for one in self.flown.values()}
+        busy = {one.task.affinity for one in self.flown.values()}
         # what a worker knows of a kin, the PSFs of a detector for example, it need not find again
         task = self.waiting.next(self._known.get(place), busy) if place else self.waiting.next()
         self._tries[task.index] += 1
         # an edge of the graph for each unit that it comes after and that is not there yet
-        after = [self._flying[k] for k in task.after if k in self._flying]
+        after = [self._flying[k] for k in task.prerequisites if k in self._flying]
         where: dict[str, Any] = {"workers": [place], "allow_other_workers": True} if place else {}
         future = self._client.submit(
             make_unit,
@@ -84,9 +84,9 @@ class Wave:
             **where,
         )
         self._flying[task.index] = future
-        self.flown[future] = Flown(task, place)
+        self.flown[future] = InFlight(task, place)
         if place:
-            self._known[place] = task.kin
+            self._known[place] = task.affinity
         future.add_done_callback(self._ended)
         return self.flown[future]
 
@@ -96,11 +96,11 @@ class Wave:
         task = self.flown.pop(future).task
         del self._flying[task.index]
         outcomes = []
-        lost = self._failed.intersection(task.after)
+        lost = self._failed.intersection(task.prerequisites)
         if future.status == "finished":
             self._missing.discard(task.index)
             outcomes = [Outcome(product.stage, task.index, future.result())]
-        elif self._missing.intersection(task.after) and not lost:
+        elif self._missing.intersection(task.prerequisites) and not lost:
             # it failed with one that it waited for, not by itself
             self._tries[task.index] -= 1
             waiting.again(task)
@@ -116,7 +116,7 @@ class Wave:
         return outcomes
 
 
-def hand_out(waves: Sequence[Wave], threads: dict[str, int]) -> None:
+def submit_units(waves: Sequence[Submission], threads: dict[str, int]) -> None:
     """Hand out as much as workers should hold: of a wave nothing while one before it has units that could begin.
 
     Parameters
@@ -126,12 +126,12 @@ def hand_out(waves: Sequence[Wave], threads: dict[str, int]) -> None:
     total = max(1, sum(threads.values()))
     # those that wait for others in flight keep nobody busy
     able = [(wave, one) for wave in waves for one in wave.flown.values() if not wave.held(one.task)]
-    room = WAVE * total - len(able)
+    room = IN_FLIGHT_PER_THREAD * total - len(able)
     free = total - sum(wave.long for wave, _ in able)
     places = Counter(one.place for wave in waves for one in wave.flown.values() if one.place)
     for wave in waves:
         held = sum(wave.held(one.task) for one in wave.flown.values())
-        while wave.waiting and held < WAVE * total:
+        while wave.waiting and held < IN_FLIGHT_PER_THREAD * total:
             if room <= 0 or (wave.long and free <= 0):
                 return
             place = min(threads, key=lambda one: places[one] / max(1, threads[one]), default=None)

@@ -7,7 +7,7 @@ import warnings
 from dataclasses import dataclass, field
 
 from romandask.products.images import ImageProduct
-from romandask.products.memory import INTERPRETER, begin_peak, give_back, peak
+from romandask.products.memory import INTERPRETER, peak_memory, release_free_memory, reset_peak
 from romandask.products.tables import TableProduct
 from romandask.storage.manifest import Record, write_record
 from romandask.storage.store import Store
@@ -24,9 +24,9 @@ class Task:
     inputs: str
     """Hash of what it depends on."""
     cost: float
-    kin: str = ""
+    affinity: str = ""
     """As that of its unit."""
-    after: tuple[int, ...] = ()
+    prerequisites: tuple[int, ...] = ()
     """Numbers of units of the same stage, made in the same run, that must be there before it."""
     parts: dict[str, str] = field(default_factory=dict)
     """What `inputs` is the hash of, by name."""
@@ -75,12 +75,12 @@ def make_unit(product: ImageProduct | TableProduct, task: Task, store: Store, *a
     start = time.perf_counter()
     if product.bytes_per_unit > LARGE:
         # what lies free in the heap would be beside what this unit takes
-        give_back()
-    held = begin_peak()
+        release_free_memory()
+    held = reset_peak()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         made = product.write(task.index, store)
-    most = peak()
+    most = peak_memory()
     told = {f"{item.category.__name__}: {item.message}" for item in caught}
     if 0 < product.bytes_per_unit < most - max(held, INTERPRETER):
         told.add(f"{product.stage} took more memory than the {product.bytes_per_unit / 2**30:.2f} GiB that it states")

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from romandask.engine.task import Task
 
 
-class Waiting:
+class TaskQueue:
     """Tasks that wait for their turn.
 
     A task is handed out when all that it comes after have been, so that it can be told to wait for them; when one of
@@ -16,8 +16,8 @@ class Waiting:
 
     def __init__(self, tasks: Sequence[Task]):
         self._families: dict[str, list[Task]] = {}
-        for task in sorted(tasks, key=lambda task: (-task.cost, task.kin, task.index)):
-            self._families.setdefault(task.kin, []).append(task)
+        for task in sorted(tasks, key=lambda task: (-task.cost, task.affinity, task.index)):
+            self._families.setdefault(task.affinity, []).append(task)
         for family in self._families.values():
             # the next one is at the end
             family.reverse()
@@ -38,7 +38,7 @@ class Waiting:
         for name in names:
             family = self._families[name]
             for place in range(len(family) - 1, -1, -1):
-                if not self._back.intersection(family[place].after):
+                if not self._back.intersection(family[place].prerequisites):
                     task = family.pop(place)
                     self._back.discard(task.index)
                     if not family:
@@ -48,14 +48,14 @@ class Waiting:
 
     def again(self, task: Task) -> None:
         """Put back a task that was handed out, to be the next of its kin."""
-        self._families.setdefault(task.kin, []).append(task)
+        self._families.setdefault(task.affinity, []).append(task)
         self._back.add(task.index)
 
     def give_up(self, index: int) -> list[Task]:
         """Take out the tasks that come after one that has failed, and those after them."""
         lost, gone = {index}, []
         waiting = [task for family in self._families.values() for task in family]
-        while found := [task for task in waiting if lost.intersection(task.after)]:
+        while found := [task for task in waiting if lost.intersection(task.prerequisites)]:
             lost |= {task.index for task in found}
             gone += found
             waiting = [task for task in waiting if task.index not in lost]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.stage_graph import stages
-from romandask.storage.checksums import broken, unseal
+from romandask.storage.checksums import damaged_files, remove_checksums
 from romandask.storage.manifest import Record, read_records
 from romandask.storage.paths import remove, remove_folder
 from romandask.storage.store import Store
@@ -50,10 +50,10 @@ def verify(survey: Survey, only: str | None = None) -> Iterator[Verified]:
             why = _damage(product, store, numbers, name, record)
             if why is not None:
                 found.append((name, why))
-        yield Verified(stage.name, len(records), tuple(found + broken(store, stage.name)))
+        yield Verified(stage.name, len(records), tuple(found + damaged_files(store, stage.name)))
     for name in BESIDE:
         if only in (None, name):
-            yield Verified(name, 0, tuple(broken(store, name)))
+            yield Verified(name, 0, tuple(damaged_files(store, name)))
 
 
 def forget(survey: Survey, found: Verified) -> None:
@@ -64,13 +64,13 @@ def forget(survey: Survey, found: Verified) -> None:
     """
     store = survey.store
     assert store is not None
-    beside = {name for name, _ in broken(store, found.stage)}
+    beside = {name for name, _ in damaged_files(store, found.stage)}
     for name, _ in found.damaged:
         if name not in beside:
             remove(store.record(found.stage, name))
     if not beside:
         return
-    unseal(store, found.stage)
+    remove_checksums(store, found.stage)
     for name in beside:
         remove(store.root / name)
     if store.images(found.stage).exists():

@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import pandas as pd
 
-from romandask.ingest.rows import DARK, Batch, file_state, identifiers, normal_form, with_reasons
+from romandask.ingest.rows import DARK, Batch, file_states, identifiers, normal_form, with_reasons
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local, state_of
+from romandask.storage.paths import AnyPath, file_state, local_copy
 
 BLOCK = 16 << 20
 """Bytes of text a batch; lines of DC2 have 170 to 260."""
@@ -57,7 +57,7 @@ class Text:
 class Source:
     """An instance catalog with the files that it includes."""
 
-    paths: dict[str, Place]
+    paths: dict[str, AnyPath]
     """By path relative to the catalog's folder."""
     texts: dict[str, Text]
     block: int
@@ -78,7 +78,7 @@ class Source:
 
     def state(self) -> Any:
         """Return bytes and times of all files."""
-        return {"files": file_state(self.paths)}
+        return {"files": file_states(self.paths)}
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return the rows of a batch in the normal form, one an object line; `merge_components` makes galaxies."""
@@ -88,7 +88,7 @@ class Source:
         return _normal(batch.source, rows)
 
 
-def open_source(path: Place, block: int = BLOCK) -> Source:
+def open_source(path: AnyPath, block: int = BLOCK) -> Source:
     """Return an instance catalog; one pass over its text finds the included files, the lines and whether it is whole.
 
     Parameters
@@ -113,7 +113,7 @@ def open_source(path: Place, block: int = BLOCK) -> Source:
     return source
 
 
-def read_header(path: Place) -> dict[str, float | int | str]:
+def read_header(path: AnyPath) -> dict[str, float | int | str]:
     """Return the header of a visit: its `key value` lines before the first object."""
     header: dict[str, float | int | str] = {}
     for line in _lines(path):
@@ -140,7 +140,7 @@ def _is_row(line: str) -> bool:
     return bool(tokens) and (tokens[0] == "object" or (len(tokens) != 2 and not tokens[0].startswith("#")))
 
 
-def _scan(path: Place, block: int) -> Text:
+def _scan(path: AnyPath, block: int) -> Text:
     """Return what a text holds, from one pass with a block in memory."""
     size, lines, rows, objects, number = 0, [], 0, 0, 0
     includes: list[str] = []
@@ -185,22 +185,22 @@ def _decoded(data: bytes) -> list[str]:
     return lines if lines[-1] else lines[:-1]
 
 
-def _binary(path: Place) -> Any:
+def _binary(path: AnyPath) -> Any:
     if not path.is_file():
         raise UserError(f"{path}: no such file; truth.path must name an instance catalog below data")
-    here = local(path)
+    here = local_copy(path)
     with open(here, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
     return gzip.open(here, "rb") if packed else open(here, "rb")
 
 
-def _lines(path: Place) -> Iterator[str]:
+def _lines(path: AnyPath) -> Iterator[str]:
     with _binary(path) as file:
         while line := file.readline(LONGEST):
             yield line.decode("utf-8", "replace")
 
 
-def _block(path: Place, start: int, stop: int) -> list[str]:
+def _block(path: AnyPath, start: int, stop: int) -> list[str]:
     """Return the lines that start within bytes start..stop."""
     before = max(start - 1, 0)
     # all of the line that runs out of the block, unless it is no line
@@ -224,7 +224,7 @@ def _block(path: Place, start: int, stop: int) -> list[str]:
 class _Unpacker:
     """A .gz that is read onwards, with the end of what was read."""
 
-    key: tuple[Place, int, int]
+    key: tuple[AnyPath, int, int]
     file: BinaryIO
     position: int = 0
     tail: bytes = b""
@@ -244,13 +244,13 @@ _LOCK = threading.Lock()
 _HELD: list[_Unpacker] = []
 
 
-def _bytes(path: Place, start: int, length: int) -> bytes:
+def _bytes(path: AnyPath, start: int, length: int) -> bytes:
     """Return bytes of the unpacked text."""
     with _binary(path) as file:
         if not isinstance(file, gzip.GzipFile):
             file.seek(start)
             return file.read(length)
-    key = (path, state_of(path)[1], os.getpid())
+    key = (path, file_state(path)[1], os.getpid())
     with _LOCK:
         # one .gz stays open in a process: the next block then needs no unpacking from the beginning
         if not _HELD or _HELD[0].key != key:

@@ -13,13 +13,13 @@ from astropy.utils.exceptions import AstropyWarning
 
 from romandask.ingest.visits import check_ranges
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local
+from romandask.storage.paths import AnyPath, local_copy
 
 COLUMNS = ("date", "exptime", "ra", "dec", "pa", "filter")
 """date is MJD; ra, dec and pa (degrees) are of the centre of the focal plane; the row index is the visit."""
 
 
-def read(path: Place) -> pd.DataFrame:
+def read(path: AnyPath) -> pd.DataFrame:
     """Return all visits: visit, band, mjd, exptime, ra, dec, pa; seeing, airmass and sky_brightness are NaN.
 
     Raises
@@ -33,7 +33,7 @@ def read(path: Place) -> pd.DataFrame:
         # a truncated table is only a warning to astropy, and then a failure far from its cause
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyWarning)
-            with fits.open(local(path), memmap=False) as hdus:
+            with fits.open(local_copy(path), memmap=False) as hdus:
                 table = hdus[1].data
                 names = {name.lower() for name in table.names}
                 data = {name: np.array(table[name]) for name in COLUMNS if name in names}

@@ -10,7 +10,7 @@ import pandas as pd
 
 from romandask.ingest.visits import check_ranges
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local
+from romandask.storage.paths import AnyPath, local_copy
 
 TABLES = ("observations", "SummaryAllProps", "Summary")
 """Newest first: the feature-based scheduler, OpSim 4 (2018-2021) and OpSim 3 (minion, kraken, enigma)."""
@@ -34,7 +34,7 @@ visit's band and airmass, its rawSeeing is at 500 nm and zenith.
 ANGLES = ("ra", "dec", "pa")
 
 
-def read(path: Place) -> pd.DataFrame:
+def read(path: AnyPath) -> pd.DataFrame:
     """Return all visits, by time; angles in degrees.
 
     Raises
@@ -45,7 +45,7 @@ def read(path: Place) -> pd.DataFrame:
     if not path.is_file():
         raise UserError(f"{path}: no such file; rubin.pointings.path must name an OpSim database (SQLite)")
     try:
-        with closing(sqlite3.connect(f"{local(path).resolve().as_uri()}?mode=ro", uri=True)) as connection:
+        with closing(sqlite3.connect(f"{local_copy(path).resolve().as_uri()}?mode=ro", uri=True)) as connection:
             table, names = _names(connection, path)
             columns = ", ".join(f'"{name}"' for name in names.values())
             visits = pd.read_sql_query(f'SELECT {columns} FROM "{table}"', connection)
@@ -77,7 +77,7 @@ def read(path: Place) -> pd.DataFrame:
     return visits.sort_values(["mjd", "visit"], ignore_index=True)
 
 
-def _names(connection: sqlite3.Connection, path: Place) -> tuple[str, dict[str, str]]:
+def _names(connection: sqlite3.Connection, path: AnyPath) -> tuple[str, dict[str, str]]:
     """Return the table of visits and the names of its columns, by ours."""
     found = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")]
     tables = [name for name in TABLES if name.lower() in {other.lower() for other in found}]

@@ -12,34 +12,34 @@ import pyarrow.parquet as pq
 
 from romandask.ingest.rows import Batch, identifiers, repeats
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local, state_of
+from romandask.storage.paths import AnyPath, file_state, local_copy
 
 CHUNK = 20_000
 """Rows decoded at once."""
 
 
-def schema(path: Place) -> pa.Schema:
+def schema(path: AnyPath) -> pa.Schema:
     """Return the schema of a file; UserError where it is missing or not complete."""
     try:
-        return pq.read_schema(local(path))
+        return pq.read_schema(local_copy(path))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except (pa.ArrowInvalid, OSError):
         raise UserError(f"{path}: not a complete Parquet file ({path.stat().st_size} bytes): copy it again") from None
 
 
-def count(path: Place) -> int:
+def count(path: AnyPath) -> int:
     """Return the rows of a file, from its footer."""
-    return pq.read_metadata(local(path)).num_rows
+    return pq.read_metadata(local_copy(path)).num_rows
 
 
-def slices(path: Place, key: str, rows: int) -> tuple[Batch, ...]:
+def slices(path: AnyPath, key: str, rows: int) -> tuple[Batch, ...]:
     """Return batches of at most `rows` rows that cover a file."""
     total = count(path)
     return tuple(Batch(path, start, min(start + rows, total), key) for start in range(0, total, rows))
 
 
-def read(path: Place, columns: list[str], start: int, stop: int) -> pa.Table:
+def read(path: AnyPath, columns: list[str], start: int, stop: int) -> pa.Table:
     """Return rows start..stop of a file; UserError where a page is damaged."""
     parts = []
     for offset, part in _pieces(path, columns, start, stop):
@@ -58,7 +58,7 @@ def _single(table: pa.Table) -> pa.Table:
 
 
 @lru_cache(maxsize=4)
-def repeated_rows(path: Place, stamp: int, column: str, pattern: str) -> np.ndarray:
+def repeated_rows(path: AnyPath, stamp: int, column: str, pattern: str) -> np.ndarray:
     """Return the rows of a file whose id an earlier row has; `stamp` is the file's time of change."""
     total = count(path)
     ids = np.empty(total, np.int64)
@@ -69,7 +69,7 @@ def repeated_rows(path: Place, stamp: int, column: str, pattern: str) -> np.ndar
 
 def repeated(batch: Batch, column: str, pattern: str) -> np.ndarray:
     """Return, for the rows of a batch, whether an earlier row of its file has the same id."""
-    rows = repeated_rows(batch.path, state_of(batch.path)[1], column, pattern)
+    rows = repeated_rows(batch.path, file_state(batch.path)[1], column, pattern)
     return np.isin(np.arange(batch.start, batch.stop), rows)
 
 
@@ -105,12 +105,12 @@ def bins(column: pa.ChunkedArray) -> np.ndarray:
     return out
 
 
-def _pieces(path: Place, columns: list[str], start: int, stop: int) -> Iterator[tuple[int, pa.RecordBatch]]:
+def _pieces(path: AnyPath, columns: list[str], start: int, stop: int) -> Iterator[tuple[int, pa.RecordBatch]]:
     """Yield (first row, rows) of the row groups that hold rows start..stop, up to `stop`."""
     try:
         # no pre-buffering: it would hold whole row groups, which hold a million rows in some files
         with pq.ParquetFile(
-            local(path), page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20
+            local_copy(path), page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20
         ) as file:
             sizes = [file.metadata.row_group(index).num_rows for index in range(file.metadata.num_row_groups)]
             ends = np.cumsum(sizes)

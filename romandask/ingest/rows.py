@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import pandas as pd
 
-from romandask.storage.paths import Place, state_of
+from romandask.storage.paths import AnyPath, file_state
 
 COMPONENTS = ("bulge", "disk", "knots")
 BANDS = "ugrizy"
@@ -22,7 +22,7 @@ FIRST_GALAXY = 50.0
 """Redshift beyond which there is none; a larger one is a mistake of its catalog, as are the limits that follow."""
 BRIGHTEST = -10.0
 """Magnitude; of Venus -5."""
-LARGEST = 600.0
+MAX_SIZE_ARCSEC = 600.0
 """Half-light radius, arcsec; that of the Large Magellanic Cloud is larger, its light is no survey's object."""
 MOST_KNOTS = 10_000
 MOST_DUST = 100.0
@@ -56,7 +56,7 @@ _NO_BINS = np.zeros(0, np.float32)
 class Batch:
     """A part of a file that one task reads."""
 
-    path: Place
+    path: AnyPath
     start: int
     """First row (tables) or byte (text)."""
     stop: int
@@ -97,9 +97,9 @@ class Source(Protocol):
         """Return the rows of the source, None if only reading tells."""
 
 
-def file_state(paths: dict[str, Place]) -> dict[str, list[int]]:
+def file_states(paths: dict[str, AnyPath]) -> dict[str, list[int]]:
     """Return by key the bytes and the time of change (ns) of files."""
-    return {key: state_of(path) for key, path in sorted(paths.items())}
+    return {key: file_state(path) for key, path in sorted(paths.items())}
 
 
 def normal_form(source: str, row: np.ndarray, kind: str | np.ndarray, columns: dict[str, Any]) -> pd.DataFrame:
@@ -207,7 +207,7 @@ def quarantine_reasons(frame: pd.DataFrame, bins: int = 0) -> dict[str, np.ndarr
             f"redshift above {FIRST_GALAXY:g}": galaxy & (value["redshift"] > FIRST_GALAXY),
             "shear or convergence beyond the weak regime": galaxy & (~(lens > 0) | ~(np.abs(value["convergence"]) < 1)),
             "size is negative or not a number": _any(shaped[c] & ~sized[c] for c in shaped),
-            f"size above {LARGEST:g} arcsec": _any(shaped[c] & (axes[c][0] > LARGEST) for c in shaped),
+            f"size above {MAX_SIZE_ARCSEC:g} arcsec": _any(shaped[c] & (axes[c][0] > MAX_SIZE_ARCSEC) for c in shaped),
             "minor axis above the major axis": _any(shaped[c] & ~ordered[c] for c in shaped),
             "position angle is not a number": galaxy & ~np.isfinite(value["position_angle_unlensed"]),
             "position angle is beyond -360 to 360 degrees": galaxy & (np.abs(value["position_angle_unlensed"]) > 360),

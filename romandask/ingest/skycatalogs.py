@@ -19,9 +19,9 @@ import yaml
 from cdshealpix import from_ring
 
 from romandask.ingest import parquet
-from romandask.ingest.rows import COMPONENTS, FLUXES, MAX_ROWS, Batch, file_state, normal_form, with_reasons
+from romandask.ingest.rows import COMPONENTS, FLUXES, MAX_ROWS, Batch, file_states, normal_form, with_reasons
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place
+from romandask.storage.paths import AnyPath
 
 TEMPLATES = {
     "galaxy": "galaxy_(?P<healpix>\\d+).parquet",
@@ -58,7 +58,7 @@ TOPHAT_ROWS = 100_000
 class File:
     """A file of one HEALPix pixel."""
 
-    path: Place
+    path: AnyPath
     kind: str
     """galaxy, star or trilegal"""
     order: int
@@ -67,7 +67,7 @@ class File:
     """The pixel, nested."""
     pixel: int
     """The pixel as the file's name has it."""
-    flux: Place | None
+    flux: AnyPath | None
     """File of Rubin fluxes of the same objects."""
 
 
@@ -108,7 +108,7 @@ class Source:
         """Return bytes and times of all files, and what the configuration says."""
         fluxes = {file.flux.name: file.flux for file in self.files.values() if file.flux}
         paths = {name: file.path for name, file in self.files.items()} | fluxes
-        return {"files": file_state(paths), "edges": list(self.edges), "mw_rv": self.mw_rv}
+        return {"files": file_states(paths), "edges": list(self.edges), "mw_rv": self.mw_rv}
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
@@ -126,7 +126,7 @@ class Source:
         return with_reasons(frame, len(self.edges) - 1, repeated)
 
 
-def open_source(folder: Place, rows: int = MAX_ROWS) -> Source:
+def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
     """Return the files of a folder, their columns checked.
 
     Parameters
@@ -172,7 +172,7 @@ def open_source(folder: Place, rows: int = MAX_ROWS) -> Source:
 class _Loader(yaml.SafeLoader):
     """Safe YAML with `!include file`, files below one folder."""
 
-    folder: Place
+    folder: AnyPath
     depth: int
 
     def include(self, node: yaml.ScalarNode) -> Any:
@@ -185,7 +185,7 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("!include", _Loader.include)
 
 
-def _read_config(path: Place, folder: Place, depth: int = 0) -> dict[str, Any]:
+def _read_config(path: AnyPath, folder: AnyPath, depth: int = 0) -> dict[str, Any]:
     try:
         loader = _Loader(path.read_text())
         loader.folder, loader.depth = folder, depth
@@ -201,7 +201,7 @@ def _read_config(path: Place, folder: Place, depth: int = 0) -> dict[str, Any]:
     return content
 
 
-def _configuration(folder: Place) -> tuple[Place, Place]:
+def _configuration(folder: AnyPath) -> tuple[AnyPath, AnyPath]:
     if folder.is_file():
         return folder, folder.parent
     if not folder.is_dir():
@@ -218,7 +218,7 @@ def _configuration(folder: Place) -> tuple[Place, Place]:
     return found[0], folder
 
 
-def _edges(config: Place, content: dict[str, Any]) -> tuple[float, ...]:
+def _edges(config: AnyPath, content: dict[str, Any]) -> tuple[float, ...]:
     """Return the edges of the top-hat bins; until schema 1.2 under SED_models, later under the galaxies."""
     for place in (content.get("SED_models"), (content.get("object_types") or {}).get("galaxy")):
         if isinstance(place, dict) and "tophat" in place:
@@ -234,7 +234,7 @@ def _edges(config: Place, content: dict[str, Any]) -> tuple[float, ...]:
     raise UserError(f"{config}: key SED_models.tophat (bins, units) is missing or not as skyCatalogs writes it")
 
 
-def _files(folder: Place, config: Place, name: str, section: Any, content: dict[str, Any]) -> dict[str, File]:
+def _files(folder: AnyPath, config: AnyPath, name: str, section: Any, content: dict[str, Any]) -> dict[str, File]:
     kind = KINDS[name]
     template = section.get("file_template", TEMPLATES[kind].replace("trilegal", name))
     partition = section.get("area_partition") or content.get("area_partition") or {}

@@ -13,7 +13,7 @@ from astropy.modeling.physical_models import BlackBody
 
 from romandask.model.errors import UserError
 from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
-from romandask.storage.paths import Place, local
+from romandask.storage.paths import AnyPath, local_copy
 
 BLACKBODY = re.compile(r"blackbody_(\d{3,6})")
 YOUNG = "flat_fnu"
@@ -64,14 +64,14 @@ def joined(*libraries: SpectrumLibrary) -> SpectrumLibrary:
     )
 
 
-def every_file(folder: Place) -> list[str]:
+def every_file(folder: AnyPath) -> list[str]:
     """Return the files of a folder of spectra, by their paths below it."""
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder of spectra")
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def read_folder(folder: Place, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
+def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
     """Return a library of the named spectra (paths below the folder) and, by name, why others are not in it.
 
     blackbody_<K> is a blackbody of that temperature and needs no file.
@@ -93,7 +93,7 @@ def read_folder(folder: Place, names: list[str]) -> tuple[SpectrumLibrary, dict[
             reasons[name] = "SED not in the library"
             continue
         try:
-            here = local(path)
+            here = local_copy(path)
             with gzip.open(here, "rt") if here.suffix == ".gz" else open(here) as file:
                 wave, flambda = np.loadtxt(file, unpack=True)[:2]
             library_from([name], [(wave, flambda)], np.array([400.0, 500.0]))

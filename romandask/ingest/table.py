@@ -21,14 +21,14 @@ from romandask.ingest.rows import (
     MAX_ROWS,
     TEXTS,
     Batch,
-    file_state,
+    file_states,
     identifiers,
     normal_form,
     repeats,
     with_reasons,
 )
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local, state_of
+from romandask.storage.paths import AnyPath, file_state, local_copy
 
 TARGETS = ("id", *FLOATS, "n_knots", *TEXTS, *FLUXES)
 """Columns of the normal form that a map may name."""
@@ -47,7 +47,7 @@ PATTERN = r"(-?\d{1,18})"
 class Source:
     """Tables of one kind of object, with the map of their columns."""
 
-    paths: dict[str, Place]
+    paths: dict[str, AnyPath]
     """By path relative to the source."""
     columns: dict[str, str]
     """The file's column by that of the normal form."""
@@ -72,7 +72,7 @@ class Source:
 
     def state(self) -> Any:
         """Return bytes and times of the files, and the map."""
-        return {"files": file_state(self.paths), "columns": self.columns, "constants": self.constants}
+        return {"files": file_states(self.paths), "columns": self.columns, "constants": self.constants}
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
@@ -91,7 +91,7 @@ class Source:
         return with_reasons(frame, 0, _repeated(batch, self.columns["id"]))
 
 
-def open_source(path: Place, columns: dict[str, str | float], kind: str, rows: int = MAX_ROWS) -> Source:
+def open_source(path: AnyPath, columns: dict[str, str | float], kind: str, rows: int = MAX_ROWS) -> Source:
     """Return a table, its map and its files checked.
 
     Parameters
@@ -138,7 +138,7 @@ def _constant(value: str | float) -> bool:
     return not isinstance(value, str) or value.startswith("=")
 
 
-def _require(path: Place, columns: dict[str, Any], kind: str, found: dict[str, str]) -> None:
+def _require(path: AnyPath, columns: dict[str, Any], kind: str, found: dict[str, str]) -> None:
     missing = [name for name in ("id", "ra", "dec") if name not in columns]
     if kind == "star":
         missing += [] if "magnorm" in columns or {"ref_mag", "ref_band"} <= set(columns) else ["magnorm"]
@@ -156,7 +156,7 @@ def _require(path: Place, columns: dict[str, Any], kind: str, found: dict[str, s
         raise UserError(f"{path}: the column map of a {kind} lacks {'; '.join(missing)} (found {', '.join(found)})")
 
 
-def _paths(path: Place) -> dict[str, Place]:
+def _paths(path: AnyPath) -> dict[str, AnyPath]:
     if path.is_file():
         return {path.name: path}
     if not path.is_dir():
@@ -168,8 +168,8 @@ def _paths(path: Place) -> dict[str, Place]:
     return found
 
 
-def _is_parquet(path: Place) -> bool:
-    with open(local(path), "rb") as file:
+def _is_parquet(path: AnyPath) -> bool:
+    with open(local_copy(path), "rb") as file:
         start = file.read(9)
     if start[:4] == b"PAR1":
         return True
@@ -179,21 +179,21 @@ def _is_parquet(path: Place) -> bool:
     raise UserError(f"{path}: neither a Parquet nor a FITS file (begins with {start[:4]!r}){hint}")
 
 
-def _count(path: Place) -> int:
+def _count(path: AnyPath) -> int:
     if _is_parquet(path):
         return parquet.count(path)
-    with fits.open(local(path), memmap=True) as hdus:
+    with fits.open(local_copy(path), memmap=True) as hdus:
         return int(_table(path, hdus).header["NAXIS2"])
 
 
-def _table(path: Place, hdus: fits.HDUList) -> fits.BinTableHDU:
+def _table(path: AnyPath, hdus: fits.HDUList) -> fits.BinTableHDU:
     for hdu in hdus:
         if isinstance(hdu, fits.BinTableHDU):
             return hdu
     raise UserError(f"{path}: holds no binary table")
 
 
-def _column_kinds(path: Place) -> dict[str, str]:
+def _column_kinds(path: AnyPath) -> dict[str, str]:
     """Return by column number, text or other; UserError where the file is not complete."""
     if _is_parquet(path):
         return {field.name: _arrow_kind(field.type) for field in parquet.schema(path)}
@@ -201,7 +201,7 @@ def _column_kinds(path: Place) -> dict[str, str]:
         with warnings.catch_warnings():
             # astropy warns of a file cut short; it is told below
             warnings.simplefilter("ignore")
-            with fits.open(local(path), memmap=True) as hdus:
+            with fits.open(local_copy(path), memmap=True) as hdus:
                 hdu = _table(path, hdus)
                 end = hdu.fileinfo()["datLoc"] + hdu.header["NAXIS1"] * hdu.header["NAXIS2"]
                 formats = [(column.name, column.format) for column in hdu.columns]
@@ -241,7 +241,7 @@ def _native(column: pa.ChunkedArray) -> np.ndarray:
 
 
 def _read_fits(batch: Batch, columns: list[str], texts: set[str]) -> dict[str, np.ndarray]:
-    with fits.open(local(batch.path), memmap=True) as hdus:
+    with fits.open(local_copy(batch.path), memmap=True) as hdus:
         rows = _table(batch.path, hdus).data[batch.start : batch.stop]
         return {name: _plain(rows[name]) for name in columns}
 
@@ -256,13 +256,13 @@ def _plain(values: np.ndarray) -> np.ndarray:
 def _repeated(batch: Batch, column: str) -> np.ndarray:
     if _is_parquet(batch.path):
         return parquet.repeated(batch, column, PATTERN)
-    rows = _repeated_in_fits(batch.path, state_of(batch.path)[1], column)
+    rows = _repeated_in_fits(batch.path, file_state(batch.path)[1], column)
     return np.isin(np.arange(batch.start, batch.stop), rows)
 
 
 @lru_cache(maxsize=4)
-def _repeated_in_fits(path: Place, stamp: int, column: str) -> np.ndarray:
-    with fits.open(local(path), memmap=True) as hdus:
+def _repeated_in_fits(path: AnyPath, stamp: int, column: str) -> np.ndarray:
+    with fits.open(local_copy(path), memmap=True) as hdus:
         data = _table(path, hdus).data
         parts = [data[start : start + MAX_ROWS][column] for start in range(0, len(data), MAX_ROWS)]
         return repeats(np.concatenate([identifiers(_plain(part), PATTERN) for part in parts] or [np.empty(0, int)]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place
+from romandask.storage.paths import AnyPath
 
 RANGES = {
     "ra": (-360.0, 720.0),
@@ -17,7 +17,7 @@ RANGES = {
 """Of our columns: what is beyond them is in other units, or no visit."""
 
 
-def check_ranges(visits: pd.DataFrame, path: Place, names: dict[str, str]) -> None:
+def check_ranges(visits: pd.DataFrame, path: AnyPath, names: dict[str, str]) -> None:
     """Check that every visit points at the sky for some time.
 
     Parameters

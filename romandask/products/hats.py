@@ -16,7 +16,7 @@ from hats.pixel_math.spatial_index import SPATIAL_INDEX_COLUMN, compute_spatial_
 from romandask.products.tables import TableProduct
 from romandask.products.units import LazyUnits, Unit
 from romandask.storage.manifest import read_record
-from romandask.storage.paths import Place, remove, write_bytes
+from romandask.storage.paths import AnyPath, remove, write_bytes
 from romandask.storage.store import MARGIN, Store
 
 WIDTH = 10.0
@@ -137,7 +137,7 @@ def write_catalog_files(product: TableProduct, store: Store, ra: str = "ra", dec
     TableProperties.model_validate(properties).to_properties_file(root)
 
 
-def _write_collection(folder: Place, name: str) -> None:
+def _write_collection(folder: AnyPath, name: str) -> None:
     content = dict(
         obs_collection=name, hats_primary_table_url="catalog", all_margins=["margin"], default_margin="margin"
     )

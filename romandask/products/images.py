@@ -29,7 +29,7 @@ from romandask.storage.arrays import (
     write_group,
 )
 from romandask.storage.manifest import digest, read_record
-from romandask.storage.paths import Place
+from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store, read_parquet, write_parquet
 
 NOTHING: Mapping[str, bytes] = MappingProxyType({})
@@ -225,7 +225,7 @@ def _made(array: Any) -> Any:
     return array() if callable(array) else array
 
 
-def table_beside(store: Store, stage: str, name: str, unit: str) -> Place:
+def table_beside(store: Store, stage: str, name: str, unit: str) -> AnyPath:
     """Return the file of a table that belongs to one unit of an image product."""
     return store.table(f"{stage}_{name}", unit)
 

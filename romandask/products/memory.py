@@ -12,22 +12,22 @@ INTERPRETER = 480 << 20
 """Bytes of a worker between units: Python, what is imported, and what it keeps of detectors and spectra."""
 
 
-def give_back() -> None:
+def release_free_memory() -> None:
     """Give free memory to the system, where the C library can: what a unit's first half took is a tenth of a worker."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
-def begin_peak() -> int:
-    """Let `peak` begin anew, where the system can (Linux), and return what it is now: what the process holds."""
+def reset_peak() -> int:
+    """Let `peak_memory` begin anew, where the system can (Linux), and return what it is now: what the process holds."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    return peak()
+    return peak_memory()
 
 
-def peak() -> int:
-    """Return the most resident memory, bytes, that this process has had since `begin_peak`."""
+def peak_memory() -> int:
+    """Return the most resident memory, bytes, that this process has had since `reset_peak`."""
     try:
         found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:

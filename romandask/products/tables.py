@@ -15,7 +15,7 @@ from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
 from romandask.products.units import Made, Unit, names_of
 from romandask.storage.manifest import digest, read_record
-from romandask.storage.paths import Place, remove
+from romandask.storage.paths import AnyPath, remove
 from romandask.storage.store import Store, read_parquet, write_parquet
 
 
@@ -178,7 +178,7 @@ class TableProduct:
         filled = [part for part in parts if len(part)]
         return pd.concat(filled, ignore_index=True) if filled else self.empty()
 
-    def _path(self, index: int, store: Store) -> Place:
+    def _path(self, index: int, store: Store) -> AnyPath:
         if self.pixels is None:
             return store.table(self.stage, self.names[index])
         return store.partition(self.stage, self.order or 0, self.pixels[index])

@@ -19,11 +19,11 @@ class Unit:
     """(stage, unit) of the upstream units that it reads."""
     cost: float = 1.0
     """Relative time, so that long units go first."""
-    after: tuple[str, ...] = ()
+    prerequisites: tuple[str, ...] = ()
     """Units of the same stage that must be there before it; `settings` and `inputs` say what it takes from them."""
     optional: tuple[tuple[str, str], ...] = ()
     """Upstream units that it reads where they are there, and can be made without."""
-    kin: str = ""
+    affinity: str = ""
     """Units of one kin are made one after another: what a worker keeps for the one it has for the next."""
 
 

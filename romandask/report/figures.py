@@ -18,7 +18,7 @@ ROMAN_RGB = ("F184", "H158", "J129", "Y106")
 RUBIN_RGB = ("z", "i", "r", "g")
 RGB = (*ROMAN_RGB, *RUBIN_RGB)
 """Bands from red to blue, of both telescopes."""
-LARGEST = 1600
+LARGEST_PICTURE_PIXELS = 1600
 """Pixels a side of a picture of a tile; larger tiles are shown by their middle."""
 
 
@@ -33,7 +33,7 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     figure = figure_of(7.2 * len(tiles), 7.4)
     extent = min(min(next(iter(bands.values())).shape) * scale for bands, scale in tiles.values())
     # very large tiles are shown by their middle, the same sky for every survey
-    extent = min(extent, LARGEST * min(scale for _, scale in tiles.values()))
+    extent = min(extent, LARGEST_PICTURE_PIXELS * min(scale for _, scale in tiles.values()))
     for position, (survey, (bands, scale)) in enumerate(tiles.items()):
         axes = figure.add_subplot(1, len(tiles), position + 1)
         chosen = colours_of_bands(tuple(bands))

@@ -20,7 +20,7 @@ from romandask.stages.analysis.validation import colours_of, depths, residuals, 
 from romandask.stages.coadds.tile_maker import unit_of
 from romandask.stages.detections.truth_match import reference_band
 from romandask.stages.pointings import corners_of
-from romandask.storage.paths import Place, bytes_below, write_bytes
+from romandask.storage.paths import AnyPath, bytes_below, write_bytes
 from romandask.survey import Survey
 
 PAPER_DEPTHS = {"Y106": 26.9, "J129": 26.9, "H158": 26.9, "F184": 26.2}
@@ -47,7 +47,7 @@ th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align
 """
 
 
-def write_report(survey: Survey) -> Place:
+def write_report(survey: Survey) -> AnyPath:
     """Write the page of a stored survey and return where it is."""
     assert survey.store is not None
     objects = {name: survey.object_product(name).all_rows() for name in survey.instruments}

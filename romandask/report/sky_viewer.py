@@ -27,7 +27,7 @@ from romandask.stages.coadds.tile_maker import TileMaker, tile_maker, unit_of
 from romandask.storage.paths import write_bytes
 from romandask.survey import Survey
 
-SIDE = 512
+PICTURE_PIXELS = 512
 """Pixels a side of a picture."""
 WIDEST = 40.0
 """Degrees that one gnomonic plane shows well."""
@@ -49,7 +49,7 @@ class Plane:
     """Pixels, east to west."""
     height: int
     """Pixels, north to south."""
-    side: int = SIDE
+    side: int = PICTURE_PIXELS
 
     @property
     def top(self) -> int:
@@ -129,7 +129,7 @@ class Layer:
         return out
 
 
-def export_atlas(survey: Survey, folder: Path) -> Path:
+def write_sky_viewer(survey: Survey, folder: Path) -> Path:
     """Write a page of a survey's coadds, and its pictures, and return where it is.
 
     Raises

@@ -32,7 +32,7 @@ EXPOSURE_LAYERS = {
     "psf": ("float32", "1/pixel", "unit star, flat f_nu, at the object's place, centred on pixel size // 2"),
 }
 """Layers of exposures beside those that are stored: dtype, unit, what they hold."""
-LARGEST = 256
+LARGEST_CUTOUT_PIXELS = 256
 """Pixels a side of the largest cutouts."""
 _EDGE = 1.0
 """Arcsec by which footprints, whose edges are arcs, are grown before the WCS decides what lies inside."""
@@ -151,8 +151,8 @@ def cutouts(
     for band in bands or ():
         if band not in known:
             raise UserError(f"band {band!r}: the images have {', '.join(known)}")
-    if not 8 <= size <= LARGEST or size % 2:
-        raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST}")
+    if not 8 <= size <= LARGEST_CUTOUT_PIXELS or size % 2:
+        raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST_CUTOUT_PIXELS}")
     chosen = np.flatnonzero(np.isin(frames.bands, bands or known))
     planes = {v.name: (v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
     if isinstance(product.make, RenderExposure):

@@ -240,7 +240,7 @@ def exposures(
         kin = f"{every[row].band}-{every[row].detector}"
         settings = {**common, "row": row, **vars(every[row])}
         if not isinstance(readout, ScaReadout):
-            return Unit(names[row], settings, inputs, kin=kin)
+            return Unit(names[row], settings, inputs, affinity=kin)
         earlier = before(table, row).tolist()
         # what an exposure leaves depends on its own light alone: on what was before it nothing else depends
         lights = [source for k in earlier for source in truth.inputs(*cone(corners[k]))]
@@ -248,7 +248,7 @@ def exposures(
         inputs = tuple(dict.fromkeys([*inputs, *lights, calibrated]))
         rays = readout.instrument.settings.cosmic_rays
         settings |= {"before": [vars(every[k]) for k in earlier], "cosmic_rays": rays}
-        return Unit(names[row], settings, inputs, after=tuple(names[k] for k in earlier), kin=kin)
+        return Unit(names[row], settings, inputs, prerequisites=tuple(names[k] for k in earlier), affinity=kin)
 
     axes = ("exposure",)
 

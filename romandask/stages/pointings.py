@@ -12,14 +12,14 @@ from romandask.instruments.instrument import EXPOSURE_COLUMNS, Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile
-from romandask.storage.paths import Place, below, reached
+from romandask.storage.paths import AnyPath, access_errors_explained, resolve_below
 
-READERS: dict[str, Callable[[Place], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
+READERS: dict[str, Callable[[AnyPath], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
 
 
 def pointings(
-    instrument: Instrument, settings, data: Place, region: Region, tiles: list[Tile], side: float, seed: int
+    instrument: Instrument, settings, data: AnyPath, region: Region, tiles: list[Tile], side: float, seed: int
 ) -> pd.DataFrame:
     """Return the exposures whose footprints touch a tile, by visit and detector (schema: catalogs/pointings.yaml).
 
@@ -35,7 +35,9 @@ def pointings(
     """
     every = visits(instrument, settings, data, region, seed)
     origin = (
-        f"{instrument.name}.pointings ({settings.source})" if settings.path is None else str(below(data, settings.path))
+        f"{instrument.name}.pointings ({settings.source})"
+        if settings.path is None
+        else str(resolve_below(data, settings.path))
     )
     every = every[every["band"].isin(instrument.bands)]
     corners = np.stack([tile.corners(side) for tile in tiles])
@@ -58,14 +60,14 @@ def pointings(
     return rows
 
 
-def visits(instrument: Instrument, settings, data: Place, region: Region, seed: int) -> pd.DataFrame:
+def visits(instrument: Instrument, settings, data: AnyPath, region: Region, seed: int) -> pd.DataFrame:
     """Return all visits of the observing sequence, whether or not they touch the region."""
     if settings.source not in READERS:
         return instrument.plan(region, seed)
     if not settings.path:
         raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
-    place = below(data, settings.path)
-    with reached(place):
+    place = resolve_below(data, settings.path)
+    with access_errors_explained(place):
         return READERS[settings.source](place)
 
 

@@ -16,7 +16,7 @@ from romandask.storage.arrays import Variable
 
 OVERSAMPLING = 8
 """Samples along a pixel."""
-SIDE = 64
+PSF_IMAGE_PIXELS = 64
 """Native pixels that an image covers."""
 
 
@@ -24,17 +24,19 @@ def psfs(exposures: ImageProduct) -> ImageProduct:
     """Return the lazy PSF images of a survey's exposures: dims (exposure, v, u), coordinates those of the exposures.
 
     Each is the PSF in the middle of the detector of a star of flat f_nu (Troxel et al. 2023, section 5.2), 8 samples a
-    pixel, its centre on sample SIDE * 8 / 2 of both axes. A sample is the share of the star's light in a native pixel
+    pixel, its centre on sample 256 of both axes. A sample is the share of the star's light in a native pixel
     centred there: every eighth sample sums to one but for the light beyond the edge.
     """
     source = exposures.make
     if not isinstance(source, RenderExposure):
         raise TypeError("PSF images need the product that exposures() returns")
     instrument, every = source.instrument, exposures.units
-    side = SIDE * OVERSAMPLING
+    side = PSF_IMAGE_PIXELS * OVERSAMPLING
 
     def unit(row: int) -> Unit:
-        return Unit(exposures.names[row], {**every[row].settings, "oversampling": OVERSAMPLING, "side": SIDE})
+        return Unit(
+            exposures.names[row], {**every[row].settings, "oversampling": OVERSAMPLING, "side": PSF_IMAGE_PIXELS}
+        )
 
     text = {
         "units": "1/pixel",
@@ -80,7 +82,7 @@ def psf_image(
     """
     bandpass = instrument.bandpass(exposure.band)
     shares = flat_shares(bandpass) if shares is None else np.asarray(shares, float) / np.sum(shares)
-    return fine_image(instrument.psf_at(exposure, x, y), shares, x, y, SIDE, OVERSAMPLING)
+    return fine_image(instrument.psf_at(exposure, x, y), shares, x, y, PSF_IMAGE_PIXELS, OVERSAMPLING)
 
 
 def flat_shares(bandpass: Bandpass) -> np.ndarray:

@@ -16,7 +16,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from romandask.model.errors import UserError
-from romandask.storage.paths import OPTIONS, Place
+from romandask.storage.paths import OPTIONS, AnyPath
 
 ROWS_A_FILE = 512
 """About, of variables that are not compressed."""
@@ -53,22 +53,22 @@ class _Whole(WrapperStore):
         return found
 
 
-def read_group(path: Place) -> zarr.Group:
+def read_group(path: AnyPath) -> zarr.Group:
     """Return a stored group for reading; chunks that are missing are errors."""
     return zarr.open_group(_Whole(_zarr_store(path)), mode="r")
 
 
-def write_group(path: Place, mode: Any = "r+") -> zarr.Group:
+def write_group(path: AnyPath, mode: Any = "r+") -> zarr.Group:
     """Return a group for writing."""
     return zarr.open_group(_zarr_store(path), mode=mode)
 
 
-def _zarr_store(path: Place) -> Any:
+def _zarr_store(path: AnyPath) -> Any:
     return LocalStore(path) if isinstance(path, Path) else FsspecStore.from_url(str(path), storage_options=OPTIONS)
 
 
 def open_images(
-    path: Place, variables: tuple[Variable, ...], lengths: tuple[int, ...], axes: tuple[str, ...]
+    path: AnyPath, variables: tuple[Variable, ...], lengths: tuple[int, ...], axes: tuple[str, ...]
 ) -> zarr.Group:
     """Open, or make, the Zarr group of an image product with `lengths` units along the axes `axes`.
 

@@ -6,11 +6,11 @@ import json
 from collections.abc import Iterable
 
 from romandask.storage.manifest import digest
-from romandask.storage.paths import Place, files_below, remove
+from romandask.storage.paths import AnyPath, files_below, remove
 from romandask.storage.store import Store, write_json
 
 
-def seal(store: Store, stage: str, paths: Iterable[Place]) -> None:
+def write_checksums(store: Store, stage: str, paths: Iterable[AnyPath]) -> None:
     """Write the hashes of some files of a stage."""
     # each once, in an order that is always the same
     files = [path for path in sorted(set(paths), key=str) if path.is_file()]
@@ -18,17 +18,17 @@ def seal(store: Store, stage: str, paths: Iterable[Place]) -> None:
     write_json(_place(store, stage), {"files": found, "check": digest(found)})
 
 
-def unseal(store: Store, stage: str) -> None:
+def remove_checksums(store: Store, stage: str) -> None:
     """Take a stage's seal away, before its files are changed."""
     remove(_place(store, stage))
 
 
-def sealed(store: Store, stage: str) -> bool:
+def has_checksums(store: Store, stage: str) -> bool:
     """True where a stage has a seal."""
     return _place(store, stage).exists()
 
 
-def broken(store: Store, stage: str) -> list[tuple[str, str]]:
+def damaged_files(store: Store, stage: str) -> list[tuple[str, str]]:
     """Return the sealed files of a stage that are not as they were, each with what was found."""
     path = _place(store, stage)
     if not path.exists():
@@ -50,11 +50,11 @@ def broken(store: Store, stage: str) -> list[tuple[str, str]]:
     return found
 
 
-def _place(store: Store, stage: str) -> Place:
+def _place(store: Store, stage: str) -> AnyPath:
     return store.root / "manifest" / stage / "files.seal"
 
 
-def image_files(store: Store, stage: str, arrays: Iterable[str]) -> list[Place]:
+def image_metadata_files(store: Store, stage: str, arrays: Iterable[str]) -> list[AnyPath]:
     """Return the metadata of an image product's arrays, and its coordinates."""
     root = store.images(stage)
     if not root.exists():
@@ -66,7 +66,7 @@ def image_files(store: Store, stage: str, arrays: Iterable[str]) -> list[Place]:
     return found
 
 
-def catalog_files(store: Store, stage: str) -> list[Place]:
+def catalog_metadata_files(store: Store, stage: str) -> list[AnyPath]:
     """Return the files of a HATS catalog that hold no rows."""
     root = store.catalog(stage)
     names = ("hats.properties", "properties", "partition_info.csv", "dataset/_metadata", "dataset/_common_metadata")

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, remove, write_new
+from romandask.storage.paths import AnyPath, remove, write_new
 
 _LOCK = ".lock"
 
 
 @contextmanager
-def locked(root: Place) -> Iterator[None]:
+def locked(root: AnyPath) -> Iterator[None]:
     """Hold the store's lock; UserError where another living driver on this host, or any on another, holds it."""
     path = root / _LOCK
     mine = {"pid": os.getpid(), "host": socket.gethostname()}
@@ -33,7 +33,7 @@ def locked(root: Place) -> Iterator[None]:
         remove(path)
 
 
-def in_use(root: Place) -> bool:
+def in_use(root: AnyPath) -> bool:
     """True where a driver holds the store: one on this host that lives, or any on another."""
     held = _holder(root / _LOCK)
     if held is None:
@@ -41,7 +41,7 @@ def in_use(root: Place) -> bool:
     return held.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(held.get("pid") or 0))
 
 
-def _holder(path: Place) -> dict | None:
+def _holder(path: AnyPath) -> dict | None:
     """Return who holds a lock; None where nobody does."""
     try:
         return json.loads(path.read_bytes())
@@ -51,7 +51,7 @@ def _holder(path: Place) -> dict | None:
         return {}
 
 
-def _refuse_or_remove(path: Place, mine: dict) -> None:
+def _refuse_or_remove(path: AnyPath, mine: dict) -> None:
     held = _holder(path) or {}
     if held.get("host", mine["host"]) != mine["host"]:
         raise UserError(f"{path.parent}: in use by a driver on {held['host']}; if it is gone, remove {path}")

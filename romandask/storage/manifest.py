@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from romandask.storage.paths import contents
+from romandask.storage.paths import read_files
 from romandask.storage.store import Store, write_json
 
 
@@ -46,7 +46,7 @@ def read_record(store: Store, stage: str, unit: str) -> Record | None:
 
 def read_records(store: Store, stage: str) -> Iterator[tuple[str, Record | None]]:
     """Yield the units of a stage that have a record, in order, and their records; None where one is damaged."""
-    for name, content in contents(store.records(stage), ".json"):
+    for name, content in read_files(store.records(stage), ".json"):
         yield name, _parsed(content)
 
 

@@ -20,7 +20,7 @@ from upath import UPath
 
 from romandask.model.errors import UserError
 
-Place = Path
+AnyPath = Path
 """A file or a folder: a Path, or a UPath, which has its methods and is said to be one."""
 SCHEMES = ("s3",)
 """Of addresses that are taken; what others do with parts of files and with two writers has not been tried."""
@@ -30,7 +30,7 @@ _AT_ONCE = 500
 """Objects that are asked for together."""
 
 
-def place_of(text: str | Place, what: str = "a store") -> Place:
+def parse_path(text: str | AnyPath, what: str = "a store") -> AnyPath:
     """Return the place that a user names, absolute.
 
     Raises
@@ -54,7 +54,7 @@ def place_of(text: str | Place, what: str = "a store") -> Place:
 
 
 @contextmanager
-def reached(place: Place) -> Iterator[None]:
+def access_errors_explained(place: AnyPath) -> Iterator[None]:
     """Turn what goes wrong with an object store (no such bucket, no answer, no credentials) into a UserError."""
     try:
         yield
@@ -70,12 +70,12 @@ def reached(place: Place) -> Iterator[None]:
         ) from None
 
 
-def below(folder: Place, text: str | Place) -> Place:
+def resolve_below(folder: AnyPath, text: str | AnyPath) -> AnyPath:
     """Return a place that is named from a folder, or by itself: an absolute path, an address."""
-    return place_of(text, "a source") if "://" in str(text) else folder / str(text)
+    return parse_path(text, "a source") if "://" in str(text) else folder / str(text)
 
 
-def local(path: Place) -> Path:
+def local_copy(path: AnyPath) -> Path:
     """Return a file of this machine with the content of another: itself, or a copy of an object.
 
     Copies are kept by their content's tag, in the folder `romandask` of the user's cache (XDG_CACHE_HOME), so that the
@@ -97,13 +97,13 @@ def local(path: Place) -> Path:
     return found
 
 
-def state_of(path: Place) -> list[int]:
+def file_state(path: AnyPath) -> list[int]:
     """Return what tells whether a file has changed: its bytes and the time (ns) at which it was written."""
     found = path.stat()
     return [int(found.st_size), int(found.st_mtime_ns)]
 
 
-def write_bytes(path: Place, content: bytes) -> None:
+def write_bytes(path: AnyPath, content: bytes) -> None:
     """Write a file so that it appears whole or not at all."""
     if not isinstance(path, Path):
         path.fs.pipe_file(path.path, content)
@@ -117,7 +117,7 @@ def write_bytes(path: Place, content: bytes) -> None:
     os.replace(temporary, path)
 
 
-def write_new(path: Place, content: bytes) -> None:
+def write_new(path: AnyPath, content: bytes) -> None:
     """Write a file that is not there yet; FileExistsError where it is, whoever else tries at the same time."""
     if isinstance(path, Path):
         with open(path, "xb") as file:
@@ -126,7 +126,7 @@ def write_new(path: Place, content: bytes) -> None:
         path.fs.pipe_file(path.path, content, mode="create")
 
 
-def remove(path: Place) -> None:
+def remove(path: AnyPath) -> None:
     """Remove a file, if it is there."""
     if isinstance(path, Path):
         path.unlink(missing_ok=True)
@@ -134,7 +134,7 @@ def remove(path: Place) -> None:
         path.fs.rm_file(path.path)
 
 
-def remove_folder(path: Place) -> None:
+def remove_folder(path: AnyPath) -> None:
     """Remove a folder and what it holds, if it is there."""
     if isinstance(path, Path):
         shutil.rmtree(path, ignore_errors=True)
@@ -142,7 +142,7 @@ def remove_folder(path: Place) -> None:
         path.fs.rm(path.path, recursive=True)
 
 
-def names_in(folder: Place, ending: str) -> list[str]:
+def file_names(folder: AnyPath, ending: str) -> list[str]:
     """Return the names, less an ending, of the files of a folder that have it; none where there is no folder."""
     try:
         if isinstance(folder, Path):
@@ -154,9 +154,9 @@ def names_in(folder: Place, ending: str) -> list[str]:
     return sorted(name.removesuffix(ending) for name in names if name.endswith(ending) and not name.startswith("."))
 
 
-def contents(folder: Place, ending: str) -> Iterator[tuple[str, bytes]]:
+def read_files(folder: AnyPath, ending: str) -> Iterator[tuple[str, bytes]]:
     """Yield the names, less an ending, and the bytes of the files of a folder that have it: of objects many at once."""
-    names = names_in(folder, ending)
+    names = file_names(folder, ending)
     if isinstance(folder, Path):
         for name in names:
             # one that a run has just removed is not there
@@ -169,14 +169,14 @@ def contents(folder: Place, ending: str) -> Iterator[tuple[str, bytes]]:
             yield keys[key], content
 
 
-def bytes_below(folder: Place) -> int:
+def bytes_below(folder: AnyPath) -> int:
     """Return the bytes of all files below a folder."""
     if isinstance(folder, Path):
         return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return int(folder.fs.du(folder.path))
 
 
-def files_below(folder: Place) -> list[Place]:
+def files_below(folder: AnyPath) -> list[AnyPath]:
     """Return all files below a folder, in order."""
     if isinstance(folder, Path):
         return sorted(path for path in folder.rglob("*") if path.is_file())

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, names_in, reached, remove, write_bytes
+from romandask.storage.paths import AnyPath, access_errors_explained, file_names, remove, write_bytes
 
 CELL = "_healpix_29"
 """Column of HEALPix cells of order 29, by which the rows of catalogs are sorted."""
@@ -30,55 +30,55 @@ MARGIN = "_margin"
 class Store:
     """A folder, of this machine or of an object store, that holds one survey."""
 
-    root: Place
+    root: AnyPath
 
     @property
-    def pipeline(self) -> Place:
+    def pipeline(self) -> AnyPath:
         """The resolved configuration."""
         return self.root / "pipeline.yaml"
 
     @property
-    def report(self) -> Place:
+    def report(self) -> AnyPath:
         """The folder of the report."""
         return self.root / "report"
 
     @property
-    def log(self) -> Place:
+    def log(self) -> AnyPath:
         """The folder of the logs of runs."""
         return self.root / "log"
 
-    def collection(self, name: str) -> Place:
+    def collection(self, name: str) -> AnyPath:
         """Folder of a HATS collection, for example truth/galaxies: a catalog and its margin."""
         return self.root / name.removesuffix(MARGIN)
 
-    def catalog(self, name: str) -> Place:
+    def catalog(self, name: str) -> AnyPath:
         """Folder of a HATS catalog, or of a margin: for example truth/galaxies, truth/galaxies_margin."""
         return self.collection(name) / ("margin" if name.endswith(MARGIN) else "catalog")
 
-    def partition(self, name: str, order: int, pixel: int) -> Place:
+    def partition(self, name: str, order: int, pixel: int) -> AnyPath:
         """File of one partition of a HATS catalog."""
         folder = pixel // 10_000 * 10_000
         return self.catalog(name) / "dataset" / f"Norder={order}" / f"Dir={folder}" / f"Npix={pixel}.parquet"
 
-    def table(self, name: str, unit: str | None = None) -> Place:
+    def table(self, name: str, unit: str | None = None) -> AnyPath:
         """File of a table that is not partitioned by the sky, whole or one unit of it."""
         return self.root / f"{name}.parquet" if unit is None else self.root / name / f"{unit}.parquet"
 
-    def images(self, name: str) -> Place:
+    def images(self, name: str) -> AnyPath:
         """Zarr group of an image product."""
         return self.root / f"{name}.zarr"
 
-    def record(self, stage: str, unit: str) -> Place:
+    def record(self, stage: str, unit: str) -> AnyPath:
         """Manifest record of one unit."""
         return self.root / "manifest" / stage / f"{unit}.json"
 
-    def records(self, stage: str) -> Place:
+    def records(self, stage: str) -> AnyPath:
         """Folder of the manifest records of a stage."""
         return self.root / "manifest" / stage
 
     def recorded(self, stage: str) -> list[str]:
         """Names of the units of a stage that have a manifest record."""
-        return names_in(self.records(stage), ".json")
+        return file_names(self.records(stage), ".json")
 
     def stages(self) -> list[str]:
         """Names of the stages that have a folder in the manifest."""
@@ -92,7 +92,7 @@ class Store:
         """Make the folder, and raise a UserError where it cannot be written."""
         probe = self.root / f".probe-{uuid.uuid4().hex}"
         try:
-            with reached(self.root):
+            with access_errors_explained(self.root):
                 write_bytes(probe, b"")
                 remove(probe)
         except OSError as error:
@@ -113,12 +113,12 @@ def refuse_full(error: BaseException | None, store: Store) -> None:
         error = error.__cause__ or error.__context__
 
 
-def write_json(path: Place, content: Any) -> None:
+def write_json(path: AnyPath, content: Any) -> None:
     """Write a JSON file whole."""
     write_bytes(path, json.dumps(content, indent=1, sort_keys=True, default=str).encode())
 
 
-def write_parquet(path: Place, table: pa.Table) -> bytes:
+def write_parquet(path: AnyPath, table: pa.Table) -> bytes:
     """Write a Parquet file whole, with page checksums, and return the bytes that were written."""
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", write_page_checksum=True, row_group_size=ROWS_A_GROUP)
@@ -127,7 +127,7 @@ def write_parquet(path: Place, table: pa.Table) -> bytes:
     return content
 
 
-def read_parquet(path: Place, columns: list[str] | None = None, between: tuple[int, int] | None = None) -> pa.Table:
+def read_parquet(path: AnyPath, columns: list[str] | None = None, between: tuple[int, int] | None = None) -> pa.Table:
     """Read a Parquet file, page checksums verified; of rows those with low <= _healpix_29 < high if asked."""
     with ExitStack() as opened:
         # an object is read by ranges, a few MB at a time

@@ -23,7 +23,7 @@ from romandask.kernels.detectors import sca
 from romandask.kernels.detectors.brighter_fatter import brighter_fatter
 from romandask.kernels.detectors.sca_exposure import Planes, accumulate, calibrate, read_out
 from romandask.kernels.detectors.simple_detector import Detector, observe
-from romandask.kernels.detectors.synthetic_sca import SIDE
+from romandask.kernels.detectors.synthetic_sca import SCA_PIXELS
 from romandask.model.seeds import rng
 from romandask.storage.manifest import Record, write_record
 from romandask.storage.store import Store
@@ -72,7 +72,7 @@ def run(folder: Path) -> None:
     held = {v.name: planes(v.name, slice(None)) for v in product.variables}
 
     def in_memory(name: str, rows: slice) -> np.ndarray:
-        return held[name][..., rows, :] if held[name].shape[-1] == SIDE else held[name]
+        return held[name][..., rows, :] if held[name].shape[-1] == SCA_PIXELS else held[name]
 
     def every_effect(given: Planes) -> None:
         charge, _ = readout.charge(exposure, light, given, response)

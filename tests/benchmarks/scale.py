@@ -28,7 +28,7 @@ from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.products.units import Made
 from romandask.stage_graph import plan
-from romandask.storage.paths import Place
+from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store
 from romandask.survey import Survey
 
@@ -57,7 +57,7 @@ class Idle:
         self.largest = 0
         """Size of the largest product that was sent to the workers, bytes."""
 
-    def recording(self, path: Place) -> AbstractContextManager[None]:
+    def recording(self, path: AnyPath) -> AbstractContextManager[None]:
         return nullcontext()
 
     def run(self, *begin: Batch, more: Callable[[], Iterable[Batch]]) -> Generator[Outcome, None, None]:

@@ -18,7 +18,7 @@ from romandask.engine import clients
 from romandask.engine.clients import runner
 from romandask.engine.submission import ATTEMPTS
 from romandask.engine.task import Batch, Task
-from romandask.engine.task_queue import Waiting
+from romandask.engine.task_queue import TaskQueue
 from romandask.model.errors import UserError
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
@@ -88,7 +88,7 @@ def test_the_last_of_a_few_long_units_does_not_wait_behind_another(tmp_path):
 
 def test_a_free_worker_goes_on_with_the_kin_that_it_knows():
     tasks = [Task(k, "inputs", 1.0, kin) for k, kin in enumerate(["a", "a", "b", "b", "c"])]
-    waiting = Waiting(tasks)
+    waiting = TaskQueue(tasks)
     assert waiting.next(None, ()).index == 0
     # another worker begins with a kin that nobody works on, and goes on with it
     assert waiting.next(None, {"a"}).index == 2
@@ -100,8 +100,13 @@ def test_a_free_worker_goes_on_with_the_kin_that_it_knows():
 
 
 def test_dear_tasks_come_first_and_none_before_what_it_comes_after():
-    tasks = [Task(0, "", 1.0, "x"), Task(1, "", 5.0, "y"), Task(2, "", 3.0, "x", after=(0,)), Task(3, "", 2.0, "z")]
-    waiting = Waiting(tasks)
+    tasks = [
+        Task(0, "", 1.0, "x"),
+        Task(1, "", 5.0, "y"),
+        Task(2, "", 3.0, "x", prerequisites=(0,)),
+        Task(3, "", 2.0, "z"),
+    ]
+    waiting = TaskQueue(tasks)
     assert [waiting.next().index for _ in tasks] == [1, 0, 2, 3]
 
 

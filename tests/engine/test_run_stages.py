@@ -17,8 +17,8 @@ from romandask import run as flow
 from romandask.engine.clients import InProcess, runner
 from romandask.engine.event_log import Log, events
 from romandask.engine.progress import Reporter
-from romandask.engine.run_stages import Run, make
-from romandask.engine.submission import WAVE, Wave, hand_out
+from romandask.engine.run_stages import Run, run_stages
+from romandask.engine.submission import IN_FLIGHT_PER_THREAD, Submission, submit_units
 from romandask.engine.task import Batch, Task
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
@@ -27,7 +27,7 @@ from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.report.stage_diagram import _reduced, kinds_read
 from romandask.stage_graph import Stage, reads, stages, tier
-from romandask.storage.checksums import unseal
+from romandask.storage.checksums import remove_checksums
 from romandask.storage.store import Store
 from romandask.survey import Survey
 
@@ -66,7 +66,7 @@ def course(stages_, folder, execution=None):
     store = Store(folder / "store")
     this = Run(None, store, execution or InProcess(), Reporter(Console(file=io.StringIO())), Log(store.log), False)
     with this.ends:
-        make(stages_, this)
+        run_stages(stages_, this)
     found = [(one["event"], one["stage"], one.get("unit")) for one in events(store.log, this.log.name)]
     return found, this.summary
 
@@ -163,15 +163,15 @@ def test_of_a_later_stage_nothing_is_handed_out_while_an_earlier_one_has_units_t
             name, tuple(Unit(f"u{k}", k) for k in range(units)), Waits(), SCHEMA, seconds_per_unit=seconds
         )
         tasks = [Task(k, "inputs", 1.0) for k in range(units)]
-        return Wave(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
+        return Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
 
     waves = [wave("coadds/x", 3, 60.0, 0), wave("truth_index/x", 100, 1.0, 1)]
-    hand_out(waves, threads)
+    submit_units(waves, threads)
     assert [sent[:2] for sent in client.sent] == [("coadds", "one"), ("coadds", "two")], "long ones one a thread"
     assert waves[0].settle(client.sent[0][2])[0].index == 0
-    hand_out(waves, threads)
+    submit_units(waves, threads)
     assert client.sent[2][:2] == ("coadds", "one"), "to the one that is free"
-    assert [name for name, *_ in client.sent[3:]] == ["truth_index"] * (WAVE * 2 - 2)
+    assert [name for name, *_ in client.sent[3:]] == ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 2)
 
 
 def test_units_that_wait_for_others_of_their_stage_do_not_keep_those_of_a_later_one_from_free_workers(tmp_path):
@@ -184,12 +184,12 @@ def test_units_that_wait_for_others_of_their_stage_do_not_keep_those_of_a_later_
     chain = [Task(k, "inputs", 20.0 - k, "", (k - 1,) if k else ()) for k in range(20)]
     alone = [Task(k, "inputs", 1.0) for k in range(20)]
     waves = [
-        Wave(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
+        Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
         for rank, (product, tasks) in enumerate([(first, chain), (second, alone)])
     ]
-    hand_out(waves, threads)
+    submit_units(waves, threads)
     sent = [name for name, *_ in client.sent]
-    assert sent == ["exposures"] * (1 + WAVE * 2) + ["truth_index"] * (WAVE * 2 - 1)
+    assert sent == ["exposures"] * (1 + IN_FLIGHT_PER_THREAD * 2) + ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 1)
 
 
 def test_nothing_goes_on_when_the_store_can_take_no_more(tmp_path, monkeypatch):
@@ -223,7 +223,7 @@ def test_what_a_run_was_stopped_before_it_could_seal_is_written_again(tmp_path, 
     (store.catalog("objects/x") / "hats.properties").touch()
     course([one], tmp_path)
     assert written == ["objects/x"], "nothing was made, nothing is written"
-    unseal(store, "objects/x")
+    remove_checksums(store, "objects/x")
     course([one], tmp_path)
     assert written == ["objects/x"] * 2
 

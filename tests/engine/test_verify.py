@@ -166,7 +166,7 @@ def test_a_disk_that_is_full_ends_the_run_with_one_line_and_the_same_command_res
     assert "No space left on device" in told[0]
     assert "the same command resumes" in told[0]
     assert not list((tmp_path / "s" / "manifest").rglob("*.failed"))
-    assert (tmp_path / "s" / "manifest" / "truth" / "incoming").is_dir()
+    assert (tmp_path / "s" / "manifest" / "truth" / "ingested").is_dir()
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import romandask
-from romandask.report.sky_viewer import Layer, _halved, _plane, export_atlas
+from romandask.report.sky_viewer import Layer, _halved, _plane, write_sky_viewer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 QUIET = (
@@ -33,7 +33,7 @@ def survey(tiny_store):
 
 @pytest.fixture(scope="module")
 def page(survey, tmp_path_factory) -> Path:
-    return export_atlas(survey, tmp_path_factory.mktemp("page"))
+    return write_sky_viewer(survey, tmp_path_factory.mktemp("page"))
 
 
 @pytest.fixture(scope="module")

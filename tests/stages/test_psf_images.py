@@ -10,7 +10,7 @@ import pytest
 from romandask.instruments.roman.roman import RomanSettings
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.rendering.seeing import fried, kolmogorov_transfer, von_karman_transfer
-from romandask.stages.psf_images import OVERSAMPLING, SIDE, flat_shares, psf_image, psfs
+from romandask.stages.psf_images import OVERSAMPLING, PSF_IMAGE_PIXELS, flat_shares, psf_image, psfs
 
 
 def drawn(instrument, exposure, x, y):
@@ -19,7 +19,7 @@ def drawn(instrument, exposure, x, y):
     profiles = instrument.profiles(exposure, x, y)
     psf = galsim.Sum([profile * share for profile, share in zip(profiles, shares, strict=True)])
     seen = galsim.Convolve(psf, galsim.Pixel(instrument.pixel_scale))
-    side, scale = SIDE * OVERSAMPLING, instrument.pixel_scale / OVERSAMPLING
+    side, scale = PSF_IMAGE_PIXELS * OVERSAMPLING, instrument.pixel_scale / OVERSAMPLING
     # centred on a sample; each sample is the light of a native pixel
     image = seen.drawImage(nx=side, ny=side, scale=scale, offset=(0.5, 0.5), method="no_pixel", dtype=float)
     return image.array * OVERSAMPLING**2

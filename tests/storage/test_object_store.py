@@ -23,7 +23,16 @@ from romandask.ingest import instance_catalog, obseq, opsim
 from romandask.model.errors import UserError
 from romandask.storage.lock import in_use, locked
 from romandask.storage.manifest import read_records
-from romandask.storage.paths import below, contents, files_below, local, place_of, remove_folder, state_of, write_new
+from romandask.storage.paths import (
+    file_state,
+    files_below,
+    local_copy,
+    parse_path,
+    read_files,
+    remove_folder,
+    resolve_below,
+    write_new,
+)
 from romandask.storage.store import Store
 
 
@@ -59,7 +68,7 @@ def bucket(tmp_path_factory):
 @pytest.fixture
 def folder(bucket):
     """A folder of the bucket that no other test uses."""
-    return place_of(f"{bucket}/{uuid.uuid4().hex}")
+    return parse_path(f"{bucket}/{uuid.uuid4().hex}")
 
 
 def upload(source: Path, to: str) -> None:
@@ -86,7 +95,7 @@ def survey(bucket, tiny_store):
 )
 def test_only_addresses_that_can_be_what_they_say_are_taken(text, what):
     with pytest.raises(UserError, match=what):
-        place_of(text)
+        parse_path(text)
 
 
 def test_a_file_that_is_there_is_not_written_again(folder):
@@ -100,24 +109,24 @@ def test_many_objects_are_read_together_and_other_endings_are_left_out(folder):
     for k in range(3):
         write_new(folder / f"u{k}.json", str(k).encode())
     write_new(folder / "u1.failed", b"why")
-    assert dict(contents(folder, ".json")) == {"u0": b"0", "u1": b"1", "u2": b"2"}
-    assert dict(contents(folder / "none", ".json")) == {}
+    assert dict(read_files(folder, ".json")) == {"u0": b"0", "u1": b"1", "u2": b"2"}
+    assert dict(read_files(folder / "none", ".json")) == {}
     assert [path.name for path in files_below(folder)] == ["u0.json", "u1.failed", "u1.json", "u2.json"]
     remove_folder(folder)
     assert files_below(folder) == []
 
 
 def test_a_source_is_fetched_once_and_again_when_it_changes(folder):
-    path = below(folder, "catalog.txt")
+    path = resolve_below(folder, "catalog.txt")
     path.write_bytes(b"old")
-    first = local(path)
+    first = local_copy(path)
     assert first.read_bytes() == b"old"
-    assert local(path) == first
-    before = state_of(path)
+    assert local_copy(path) == first
+    before = file_state(path)
     time.sleep(1.1)
     path.write_bytes(b"new")
-    assert local(path).read_bytes() == b"new"
-    assert state_of(path) != before
+    assert local_copy(path).read_bytes() == b"new"
+    assert file_state(path) != before
 
 
 def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(folder):
@@ -173,7 +182,7 @@ def test_a_survey_in_a_bucket_is_read_and_verified_as_one_in_a_folder(survey, ti
 
 
 def test_what_is_damaged_in_a_bucket_is_found_and_made_again_to_the_byte(survey, tiny_store, tmp_path):
-    there = place_of(survey)
+    there = parse_path(survey)
     chunk = next(path for path in files_below(there / "coadds/rubin.zarr/image") if path.name != "zarr.json")
     table = next(path for path in files_below(there / "objects/roman/catalog/dataset") if path.name.startswith("Npix"))
     content = table.read_bytes()
@@ -205,7 +214,7 @@ def test_a_pipeline_and_its_sources_are_read_from_a_bucket(bucket, shared, tmp_p
         counts.append(done.stdout.splitlines()[-1])
     assert counts[0] == counts[1]
     assert "rows in" in counts[0]
-    (place_of(bucket) / "p.yaml").write_text(
+    (parse_path(bucket) / "p.yaml").write_text(
         "name: p\nseed: 1\nregion: {ra: [53, 53.01], dec: [-40, -39.99]}\nroman: {}\n"
     )
     assert command("plan", f"{bucket}/p.yaml").returncode == 0
@@ -219,13 +228,13 @@ def test_every_kind_of_source_reads_the_same_from_a_bucket(bucket, shared):
         (opsim.read, sorted((shared / "opsim").glob("*.db"))[0]),
         (obseq.read, sorted((shared / "roman_obseq").glob("*.fits"))[0]),
     ):
-        pd.testing.assert_frame_equal(read(place_of(f"{bucket}/{name.relative_to(shared)}")), read(name))
+        pd.testing.assert_frame_equal(read(parse_path(f"{bucket}/{name.relative_to(shared)}")), read(name))
     name = next(
         path.name for path in sorted((shared / "dc2_instance_catalog").iterdir()) if path.name.startswith("example")
     )
     here, there = (
         instance_catalog.open_source(folder / name)
-        for folder in (shared / "dc2_instance_catalog", place_of(f"{bucket}/dc2"))
+        for folder in (shared / "dc2_instance_catalog", parse_path(f"{bucket}/dc2"))
     )
     assert [batch.name for batch in here.batches()] == [batch.name for batch in there.batches()]
     for first, second in zip(here.batches(), there.batches(), strict=True):

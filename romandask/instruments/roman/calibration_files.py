@@ -12,7 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from romandask.model.errors import UserError
-from romandask.storage.paths import Place, local
+from romandask.storage.paths import AnyPath, local_copy
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ _BITPIX = {"f4": (-32, 0), "f8": (-64, 0), "i4": (32, 0), "u4": (32, 1 << 31), "
 """BITPIX and BZERO of each dtype."""
 
 
-def path_of(folder: Place, sca: int) -> Place:
+def path_of(folder: AnyPath, sca: int) -> AnyPath:
     """Return the file of an SCA in a folder."""
     return folder / f"sca{sca:02d}.fits"
 
@@ -114,7 +114,7 @@ def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source
         temporary.unlink(missing_ok=True)
 
 
-def check(path: Place) -> None:
+def check(path: AnyPath) -> None:
     """Check that a file has every extension of table 1, in its order, with its type and shape; read no values.
 
     Raises
@@ -123,7 +123,7 @@ def check(path: Place) -> None:
         That names the file, the extension, what was found, and what is expected.
     """
     try:
-        with fits.open(local(path), lazy_load_hdus=False) as file:
+        with fits.open(local_copy(path), lazy_load_hdus=False) as file:
             found = [hdu.name for hdu in file[1:]]
             missing = [extension.name for extension in TABLE if extension.name not in found]
             if missing:
@@ -141,7 +141,7 @@ def check(path: Place) -> None:
         raise UserError(f"{path}: not a FITS file that can be read ({error})") from None
 
 
-def _check_values(path: Place, header: fits.Header, extension: Extension) -> None:
+def _check_values(path: AnyPath, header: fits.Header, extension: Extension) -> None:
     shape = tuple(header.get(f"NAXIS{k}", 0) for k in range(header.get("NAXIS", 0), 0, -1))
     if shape != extension.shape:
         raise UserError(f"{path}: {extension.name} has shape {shape}, expected {extension.shape}")
@@ -153,7 +153,7 @@ def _check_values(path: Place, header: fits.Header, extension: Extension) -> Non
         )
 
 
-def read(path: Place, name: str) -> np.ndarray:
+def read(path: AnyPath, name: str) -> np.ndarray:
     """Return the values of an extension, in the machine's byte order.
 
     Raises
@@ -163,7 +163,7 @@ def read(path: Place, name: str) -> np.ndarray:
     """
     extension = BY_NAME[name]
     try:
-        with fits.open(local(path), memmap=False) as file:
+        with fits.open(local_copy(path), memmap=False) as file:
             hdu = file[name]
             _check_values(path, hdu.header, extension)
             values = np.asarray(hdu.data).astype(extension.dtype, copy=False)
@@ -178,6 +178,6 @@ def read(path: Place, name: str) -> np.ndarray:
     return values
 
 
-def _datasum(path: Place, name: str) -> str:
-    with fits.open(local(path), memmap=True, do_not_scale_image_data=True) as file:
+def _datasum(path: AnyPath, name: str) -> str:
+    with fits.open(local_copy(path), memmap=True, do_not_scale_image_data=True) as file:
         return str(file[name]._calculate_datasum())

@@ -13,14 +13,14 @@ from romandask.instruments.roman.calibration_files import TABLE, check, path_of,
 from romandask.kernels.detectors.synthetic_sca import charge_diffusion, planes
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
-from romandask.storage.paths import Place, state_of
+from romandask.storage.paths import AnyPath, file_state
 
 
 @dataclass(frozen=True)
 class CalibrationSource:
     """The calibrations of all SCAs."""
 
-    folder: Place | None
+    folder: AnyPath | None
     """Of files sca01.fits to sca18.fits; None for made-up SCAs."""
     seed: int
     """Of those."""
@@ -69,7 +69,7 @@ class CalibrationSource:
         path = path_of(self.folder, sca)
         if not path.is_file():
             return str(path)
-        return (str(path), *state_of(path))
+        return (str(path), *file_state(path))
 
 
 @lru_cache(maxsize=18)

@@ -20,10 +20,10 @@ from romandask.kernels.universe.bandpasses import roman_bandpass
 
 FOLDS = {"Y106": 3, "J129": 3, "H158": 2, "F184": 2}
 """How many times the pixels' Nyquist frequency the optics reach in each band."""
-EXTENT = 4096
+PSF_EXTENT_PIXELS = 4096
 """Pixels, a side, that a PSF of the unbinned pupil covers; one of a binned pupil covers so many times less."""
-SIDE = galsim.roman.n_pix
-MIDDLE = (SIDE / 2 - 0.5, SIDE / 2 - 0.5)
+ACTIVE_PIXELS = galsim.roman.n_pix
+MIDDLE = (ACTIVE_PIXELS / 2 - 0.5, ACTIVE_PIXELS / 2 - 0.5)
 """Of an SCA, pixels, 0 at the first pixel's centre."""
 _ALONE = RLock()
 
@@ -105,7 +105,7 @@ def _aberrations(sca: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @lru_cache(maxsize=128)
 def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, float]:
     """Return how bright a unit star is at the edges of stamps: the brighter of the band's ends."""
-    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(EXTENT // 8, FOLDS[band])
+    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(PSF_EXTENT_PIXELS // 8, FOLDS[band])
     return edge_brightness(transforms(sca, band, waves[[0, -1]], 8, MIDDLE, grid, diffusion), grid)
 
 
@@ -114,8 +114,8 @@ def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, floa
 def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     """Return the PSF of an SCA and band, as it varies over the SCA by polynomials of a degree; 0: it does not."""
     waves, lens = roman_bandpass(band, n_waves).nodes, pupil(sca, band, 8)
-    grid, core = Grid(EXTENT // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
-    places = place_grid((SIDE, SIDE), degree) if degree else np.empty((0, 2))
+    grid, core = Grid(PSF_EXTENT_PIXELS // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
+    places = place_grid((ACTIVE_PIXELS, ACTIVE_PIXELS), degree) if degree else np.empty((0, 2))
     nodes = transforms(sca, band, waves, 8, MIDDLE, grid, diffusion)
     differences = np.empty((n_waves, len(places), *core.shape), np.complex64)
     middle = grid.within(nodes, core.size)
@@ -123,7 +123,7 @@ def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -
         near = diffraction(lens, wave, core, galsim.roman.pixel_scale, diffusion)
         for number, place in enumerate(places):
             differences[node, number] = near.transform(aberrations(sca, wave, tuple(place))) - middle[node]
-    return model(nodes, grid, Variation((SIDE, SIDE), degree, differences) if degree else None)
+    return model(nodes, grid, Variation((ACTIVE_PIXELS, ACTIVE_PIXELS), degree, differences) if degree else None)
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from romandask.instruments.instrument import WHOLE, Exposure, pixel_areas
 from romandask.instruments.roman.calibration_source import CalibrationSource
 from romandask.instruments.roman.focal_plane import SCAS, corners, header_of
 from romandask.instruments.roman.optics import (
-    EXTENT,
+    ACTIVE_PIXELS,
     FOLDS,
     MIDDLE,
-    SIDE,
+    PSF_EXTENT_PIXELS,
     WideNodes,
     edges,
     optics,
@@ -109,7 +109,7 @@ class Roman:
     coadd_scale: float = 0.0575
     """arcsec"""
     pixel_scale: float = galsim.roman.pixel_scale
-    shape: tuple[int, int] = (SIDE, SIDE)
+    shape: tuple[int, int] = (ACTIVE_PIXELS, ACTIVE_PIXELS)
     detectors: tuple[int, ...] = SCAS
     field_radius: float = 0.6
     knot_smoothing: float = KNOT_SMOOTHING
@@ -189,7 +189,7 @@ class Roman:
             place = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
             shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(waves))), 0, 1)
             # of the finest frequencies in the shortest band their cores alone have any
-            grid = Grid(EXTENT // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
+            grid = Grid(PSF_EXTENT_PIXELS // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
             nodes = WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
             found.append(BrightPsf(zero * 10 ** (-0.4 * magnitude), grid, nodes, shares))
         return tuple(found)

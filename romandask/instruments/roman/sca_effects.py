@@ -12,7 +12,7 @@ from romandask.instruments.instrument import exposure_of
 from romandask.instruments.roman.sca_readout import age_and_traps
 from romandask.kernels.detectors.sca import count_rate_nonlinearity, expand, quantum_efficiency
 from romandask.kernels.detectors.sca_exposure import Planes, Response, accumulate, afterglow, read_out
-from romandask.kernels.detectors.synthetic_sca import BORDER, REFERENCE, SIDE
+from romandask.kernels.detectors.synthetic_sca import REFERENCE, REFERENCE_PIXELS, SCA_PIXELS
 from romandask.products.images import ImageProduct
 from romandask.stages.exposures import RenderExposure
 
@@ -77,8 +77,8 @@ def differences(exposures: ImageProduct, index: int, side: int = 96) -> list[Dif
 
 def _of_light(light: np.ndarray, planes: Planes, response: Response, square: tuple[slice, slice]) -> list[Difference]:
     """Return the effects on what is expected."""
-    rows = slice(square[0].start + BORDER, square[0].stop + BORDER)
-    columns = slice(square[1].start + BORDER, square[1].stop + BORDER)
+    rows = slice(square[0].start + REFERENCE_PIXELS, square[0].stop + REFERENCE_PIXELS)
+    columns = slice(square[1].start + REFERENCE_PIXELS, square[1].stop + REFERENCE_PIXELS)
     here = light[square]
     white, exponent = planes("RELQE1", rows)[:, columns], planes("CRNL", rows)[0][:, columns].astype(np.float32)
     seen = quantum_efficiency(here, white, expand(response.efficiency, 64, rows, columns))
@@ -94,14 +94,14 @@ def _changed(planes: Planes, changed: str, neutral: Callable[[np.ndarray], np.nd
 
 def _electrons(numbers: np.ndarray, planes: Planes, square: tuple[slice, slice]) -> np.ndarray:
     """Return a square of data numbers in electrons."""
-    rows, columns = (slice(part.start + BORDER, part.stop + BORDER) for part in square)
+    rows, columns = (slice(part.start + REFERENCE_PIXELS, part.stop + REFERENCE_PIXELS) for part in square)
     return numbers[square].astype(np.float32) * expand(planes("GAIN", slice(None)), 128, rows, columns)
 
 
 def _square(truth: np.ndarray, side: int) -> tuple[slice, slice]:
     """Return the square around the brightest pixel."""
     corner = [
-        int(np.clip(place - side // 2, 0, SIDE - 2 * BORDER - side))
+        int(np.clip(place - side // 2, 0, SCA_PIXELS - 2 * REFERENCE_PIXELS - side))
         for place in np.unravel_index(truth.argmax(), truth.shape)
     ]
     return slice(corner[0], corner[0] + side), slice(corner[1], corner[1] + side)

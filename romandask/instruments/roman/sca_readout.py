@@ -29,7 +29,7 @@ from romandask.kernels.detectors.sca_exposure import (
     read_out,
     trap,
 )
-from romandask.kernels.detectors.synthetic_sca import SIDE, WAVES
+from romandask.kernels.detectors.synthetic_sca import SCA_SHAPE, WAVES
 from romandask.model.seeds import rng
 from romandask.products.images import ImageProduct
 from romandask.storage.arrays import ROWS_A_FILE
@@ -92,7 +92,10 @@ class ScaReadout:
         """Return the electrons (4096, 4096) of cosmic rays; None where there are to be none."""
         if not self.instrument.settings.cosmic_rays:
             return None
-        return hits((SIDE, SIDE), tracks((SIDE, SIDE), exposure.exptime, self.random(exposure, "rays", 0)))
+        return hits(
+            SCA_SHAPE,
+            tracks(SCA_SHAPE, exposure.exptime, self.random(exposure, "rays", 0)),
+        )
 
     def __call__(
         self, exposure: Exposure, light: np.ndarray, left: Sequence[tuple[Exposure, pd.DataFrame]]

@@ -12,7 +12,7 @@ import numpy as np
 
 REACH = 2
 """Kernels are (2 REACH + 1)^2: 5 x 5."""
-_SIDE = 2 * REACH + 1
+_KERNEL_PIXELS = 2 * REACH + 1
 
 
 def potentials(areas: np.ndarray) -> np.ndarray:
@@ -25,19 +25,19 @@ def potentials(areas: np.ndarray) -> np.ndarray:
     The Laplacian of the result is minus the kernel in all of its 5 x 5 cells. A kernel whose sum is not zero moves area
     to the pixels just beyond it, for what one pixel loses its neighbour gains.
     """
-    n = _SIDE * _SIDE
+    n = _KERNEL_PIXELS * _KERNEL_PIXELS
     operator = np.zeros((n, n))
-    for j in range(_SIDE):
-        for i in range(_SIDE):
-            here = j * _SIDE + i
+    for j in range(_KERNEL_PIXELS):
+        for i in range(_KERNEL_PIXELS):
+            here = j * _KERNEL_PIXELS + i
             operator[here, here] = 4.0
             for b, a in ((j - 1, i), (j + 1, i), (j, i - 1), (j, i + 1)):
-                if 0 <= b < _SIDE and 0 <= a < _SIDE:
-                    operator[here, b * _SIDE + a] = -1.0
+                if 0 <= b < _KERNEL_PIXELS and 0 <= a < _KERNEL_PIXELS:
+                    operator[here, b * _KERNEL_PIXELS + a] = -1.0
     flat = np.asarray(areas, float).reshape(-1, n)
-    inner = np.linalg.solve(operator, flat.T).T.reshape(-1, _SIDE, _SIDE)
+    inner = np.linalg.solve(operator, flat.T).T.reshape(-1, _KERNEL_PIXELS, _KERNEL_PIXELS)
     padded = np.pad(inner, ((0, 0), (1, 1), (1, 1)))
-    return padded.reshape(*np.shape(areas)[:-2], _SIDE + 2, _SIDE + 2)
+    return padded.reshape(*np.shape(areas)[:-2], _KERNEL_PIXELS + 2, _KERNEL_PIXELS + 2)
 
 
 def brighter_fatter(charge: np.ndarray, areas: np.ndarray, block: int, origin: tuple[int, int] = (0, 0)) -> np.ndarray:

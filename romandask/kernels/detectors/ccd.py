@@ -18,7 +18,7 @@ NOISE_SPREAD, WELL_SPREAD = 0.05, 0.05
 """Of read noise and full well, relative."""
 BIAS, BIAS_SPREAD = 22_000.0, 500.0
 """Data numbers that are added before conversion."""
-LARGEST = (1 << 18) - 1
+LARGEST_DN = (1 << 18) - 1
 """Largest data number."""
 COSMIC_RAY = 256
 CCD_FLAGS = {"saturated": SATURATED, "no_data": NO_DATA, "cosmic_ray": COSMIC_RAY}
@@ -139,7 +139,7 @@ def read_out(
         rows = slice(first, min(first + ROWS, charge.shape[0]))
         gain, bias, noise = _over_rows(amplifiers, charge.shape, rows)
         drawn = generators(block).standard_normal(gain.shape, dtype=np.float32)
-        raw[rows] = np.clip(np.rint((charge[rows] + noise * drawn) / gain + bias), 0, LARGEST)
+        raw[rows] = np.clip(np.rint((charge[rows] + noise * drawn) / gain + bias), 0, LARGEST_DN)
     return raw
 
 

@@ -16,7 +16,7 @@ MEMORY = 10.0
 """Exposure times for which persistence is followed."""
 RATE = 100.0
 """Electrons a second at which count-rate nonlinearity is defined to do nothing."""
-LARGEST = 65535
+LARGEST_DN = 65535
 """Of the data numbers that a detector returns."""
 
 
@@ -183,4 +183,4 @@ def without_capacitance(
 
 def digitise(signal: np.ndarray, gain: np.ndarray, bias: np.ndarray) -> np.ndarray:
     """Return data numbers (uint16) of signals in electrons: over the gain (e/DN), plus the bias, rounded, clipped."""
-    return np.clip(np.rint(signal / gain + bias), 0, LARGEST).astype(np.uint16)
+    return np.clip(np.rint(signal / gain + bias), 0, LARGEST_DN).astype(np.uint16)

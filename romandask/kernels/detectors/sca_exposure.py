@@ -25,7 +25,15 @@ from romandask.kernels.detectors.sca import (
     without_capacitance,
 )
 from romandask.kernels.detectors.simple_detector import PERSISTENCE, SATURATED
-from romandask.kernels.detectors.synthetic_sca import ADJACENT, BORDER, DISCONNECTED, HOT, LOW_EFFICIENCY, NOISY, SIDE
+from romandask.kernels.detectors.synthetic_sca import (
+    ADJACENT,
+    DISCONNECTED,
+    HOT,
+    LOW_EFFICIENCY,
+    NOISY,
+    REFERENCE_PIXELS,
+    SCA_PIXELS,
+)
 
 DISCONNECTED_FLAG, HOT_FLAG, ADJACENT_FLAG, LOW_EFFICIENCY_FLAG, NOISY_FLAG = 4, 8, 16, 32, 64
 COSMIC_RAY_FLAG = 256
@@ -94,7 +102,7 @@ def accumulate(
     light : (4088, 4088) expected electrons of objects, sky and thermal emission, at nominal efficiency
     rays : (4096, 4096) electrons of cosmic rays (cosmic_rays.hits); None for none
     """
-    charge = np.empty((SIDE, SIDE), np.float32)
+    charge = np.empty((SCA_PIXELS, SCA_PIXELS), np.float32)
     for block, rows in enumerate(_blocks()):
         mean = _padded(light, rows)
         mean = quantum_efficiency(mean, planes("RELQE1", rows), expand(response.efficiency, 64, rows))
@@ -114,17 +122,17 @@ def trap(charge: np.ndarray, planes: Planes) -> Trapped:
     """
     found = []
     for rows in _blocks():
-        first, last = max(rows.start, BORDER), min(rows.stop, SIDE - BORDER)
+        first, last = max(rows.start, REFERENCE_PIXELS), min(rows.stop, SCA_PIXELS - REFERENCE_PIXELS)
         here = np.minimum(
-            charge[first:last, BORDER : SIDE - BORDER],
-            planes("SATURATE", slice(first, last))[:, BORDER : SIDE - BORDER],
+            charge[first:last, REFERENCE_PIXELS : SCA_PIXELS - REFERENCE_PIXELS],
+            planes("SATURATE", slice(first, last))[:, REFERENCE_PIXELS : SCA_PIXELS - REFERENCE_PIXELS],
         )
         y, x = np.nonzero(here > STIMULI[0] / 2)
         released = persistence(
-            here[y, x], planes("PERSIST", slice(first, last))[:, y, x + BORDER].astype(np.float32), 1.0
+            here[y, x], planes("PERSIST", slice(first, last))[:, y, x + REFERENCE_PIXELS].astype(np.float32), 1.0
         )
         kept = released >= LEAST
-        pixel = (y[kept] + first - BORDER) * (SIDE - 2 * BORDER) + x[kept]
+        pixel = (y[kept] + first - REFERENCE_PIXELS) * (SCA_PIXELS - 2 * REFERENCE_PIXELS) + x[kept]
         found.append((pixel.astype(np.int32), released[kept].astype(np.float32)))
     return Trapped(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
@@ -133,7 +141,7 @@ def afterglow(left: Sequence[tuple[Trapped, float]]) -> np.ndarray | None:
     """Return the current (4088, 4088), e/s, of what exposures left, each with its age, s; None where there are none."""
     if not left:
         return None
-    side = SIDE - 2 * BORDER
+    side = SCA_PIXELS - 2 * REFERENCE_PIXELS
     current = np.zeros(side * side, np.float32)
     for trapped, age in left:
         current[trapped.pixel] += trapped.charge / np.float32(age)
@@ -155,11 +163,11 @@ def read_out(
     late : (4088, 4088) current, e/s, of charge that earlier exposures left (`afterglow`); None for none
     rays : (4096, 4096) electrons of cosmic rays that are in the charge; None for none
     """
-    inner = slice(BORDER, SIDE - BORDER)
-    dq = np.zeros((SIDE, SIDE), np.uint16)
+    inner = slice(REFERENCE_PIXELS, SCA_PIXELS - REFERENCE_PIXELS)
+    dq = np.zeros((SCA_PIXELS, SCA_PIXELS), np.uint16)
     if rays is not None:
         dq[rays > JUMP] |= COSMIC_RAY_FLAG
-    signal = np.empty((SIDE, SIDE), np.float32)
+    signal = np.empty((SCA_PIXELS, SCA_PIXELS), np.float32)
     for block, rows in enumerate(_blocks()):
         dark = planes("DARK", rows).astype(np.float32) * np.float32(response.exptime)
         if late is not None:
@@ -172,7 +180,7 @@ def read_out(
         dq[rows][full] |= SATURATED
         signal[rows] = nonlinear(electrons, planes("CNL", rows))
     signal = interpixel_capacitance(signal, planes("IPC", slice(None)), 8)
-    numbers = np.empty((SIDE, SIDE), np.uint16)
+    numbers = np.empty((SCA_PIXELS, SCA_PIXELS), np.uint16)
     for block, rows in enumerate(_blocks()):
         bits, here = planes("BADPIX", rows), signal[rows]
         here[bits & DISCONNECTED > 0] = 0
@@ -191,19 +199,19 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
     nonlinearity are undone, with the detector's own calibration; the brighter-fatter effect, which moves charge between
     neighbours and loses none, is not. Of pixels that catch no light both results are 0.
     """
-    inner = slice(BORDER, SIDE - BORDER)
-    signal = np.zeros((SIDE, SIDE), np.float32)
+    inner = slice(REFERENCE_PIXELS, SCA_PIXELS - REFERENCE_PIXELS)
+    signal = np.zeros((SCA_PIXELS, SCA_PIXELS), np.float32)
     signal[inner, inner] = numbers
     kernels = planes("IPC", slice(None))
     for rows in _blocks():
         gain = expand(planes("GAIN", slice(None)), 128, rows)
         signal[rows] = (signal[rows] - planes("BIAS", rows)) * gain
     # beyond what was read there is nothing
-    edge = np.ones((SIDE, SIDE), bool)
+    edge = np.ones((SCA_PIXELS, SCA_PIXELS), bool)
     edge[inner, inner] = False
     signal[edge] = 0
     signal = without_capacitance(signal, kernels, 8)
-    variance = np.empty((SIDE, SIDE), np.float32)
+    variance = np.empty((SCA_PIXELS, SCA_PIXELS), np.float32)
     for rows in _blocks():
         electrons = linear(signal[rows], planes("CNL", rows), 3)
         dark = planes("DARK", rows).astype(np.float32) * np.float32(response.exptime)
@@ -225,12 +233,15 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
 
 
 def _blocks() -> list[slice]:
-    return [slice(first, first + _ROWS) for first in range(0, SIDE, _ROWS)]
+    return [slice(first, first + _ROWS) for first in range(0, SCA_PIXELS, _ROWS)]
 
 
 def _padded(image: np.ndarray, rows: slice) -> np.ndarray:
     """Return rows of the whole detector of an image of its active pixels: reference pixels have nothing."""
-    out = np.zeros((rows.stop - rows.start, SIDE), np.float32)
-    first, last = max(rows.start - BORDER, 0), min(rows.stop - BORDER, image.shape[0])
-    out[first + BORDER - rows.start : last + BORDER - rows.start, BORDER : SIDE - BORDER] = image[first:last]
+    out = np.zeros((rows.stop - rows.start, SCA_PIXELS), np.float32)
+    first, last = max(rows.start - REFERENCE_PIXELS, 0), min(rows.stop - REFERENCE_PIXELS, image.shape[0])
+    out[
+        first + REFERENCE_PIXELS - rows.start : last + REFERENCE_PIXELS - rows.start,
+        REFERENCE_PIXELS : SCA_PIXELS - REFERENCE_PIXELS,
+    ] = image[first:last]
     return out

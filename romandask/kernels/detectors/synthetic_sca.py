@@ -12,9 +12,10 @@ import numpy as np
 
 from romandask.kernels.detectors.sca import STIMULI
 
-SIDE = 4096
+SCA_PIXELS = 4096
 """Pixels along a side, the border of reference pixels included."""
-BORDER = 4
+SCA_SHAPE = (SCA_PIXELS, SCA_PIXELS)
+REFERENCE_PIXELS = 4
 """Reference pixels at each edge, which see no light."""
 CHANNELS = 32
 """Readout channels, stripes of 128 columns."""
@@ -38,13 +39,13 @@ Generator = Callable[[str], np.random.Generator]
 
 
 def bad_pixels(of: Generator) -> np.ndarray:
-    """Return BADPIX (SIDE, SIDE) uint32: disconnected and hot pixels with their neighbours, weak, noisy, reference."""
+    """Return BADPIX (y, x) uint32: disconnected and hot pixels with their neighbours, weak, noisy, reference."""
     rng = of("BADPIX")
-    bits = np.zeros((SIDE, SIDE), np.uint32)
-    inner = SIDE - 2 * BORDER
+    bits = np.zeros(SCA_SHAPE, np.uint32)
+    inner = SCA_PIXELS - 2 * REFERENCE_PIXELS
     for bit, share in ((DISCONNECTED, 3e-4), (HOT, 1e-3), (LOW_EFFICIENCY, 8e-4), (NOISY, 2e-3)):
         count = rng.poisson(share * inner**2)
-        y, x = rng.integers(BORDER, SIDE - BORDER, (2, count))
+        y, x = rng.integers(REFERENCE_PIXELS, SCA_PIXELS - REFERENCE_PIXELS, (2, count))
         bits[y, x] |= np.uint32(bit)
         if bit in (DISCONNECTED, HOT):
             for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
@@ -54,13 +55,13 @@ def bad_pixels(of: Generator) -> np.ndarray:
 
 
 def relative_efficiency(of: Generator, bits: np.ndarray) -> np.ndarray:
-    """Return RELQE1 (SIDE, SIDE): 1 with a slope of a per cent, 0.7% from pixel to pixel, weak pixels 0.2 to 0.8."""
+    """Return RELQE1 (y, x): 1 with a slope of a per cent, 0.7% from pixel to pixel, weak pixels 0.2 to 0.8."""
     rng = of("RELQE1")
-    along = np.linspace(-1, 1, SIDE, dtype=np.float32)
+    along = np.linspace(-1, 1, SCA_PIXELS, dtype=np.float32)
     tilt = rng.normal(0, 0.005, 5)
     plane = 1 + tilt[0] * along[:, None] + tilt[1] * along + tilt[2] * along[:, None] * along
     plane = plane + tilt[3] * (along[:, None] ** 2 - 1 / 3) + tilt[4] * (along**2 - 1 / 3)
-    plane = (plane + 0.007 * rng.standard_normal((SIDE, SIDE), np.float32)).astype(np.float32)
+    plane = (plane + 0.007 * rng.standard_normal(SCA_SHAPE, np.float32)).astype(np.float32)
     weak = bits & LOW_EFFICIENCY > 0
     plane[weak] = rng.uniform(0.2, 0.8, weak.sum())
     plane[bits & REFERENCE > 0] = 0
@@ -98,19 +99,19 @@ def area_kernels(of: Generator) -> np.ndarray:
 
 
 def released_charge(of: Generator) -> np.ndarray:
-    """Return PERSIST (6, SIDE, SIDE), electrons: about 1e-4 of the charge at 1e4 e, 2e-3 at full well, 30% a pixel."""
+    """Return PERSIST (6, y, x), electrons: about 1e-4 of the charge at 1e4 e, 2e-3 at full well, 30% a pixel."""
     rng = of("PERSIST")
     share = np.array([5e-5, 7e-5, 1e-4, 3e-4, 2e-3, 2.5e-3]) * STIMULI
-    scatter = np.exp(0.3 * rng.standard_normal((SIDE, SIDE), np.float32))
+    scatter = np.exp(0.3 * rng.standard_normal(SCA_SHAPE, np.float32))
     planes = share.astype(np.float32)[:, None, None] * scatter
     planes[:, _border()] = 0
     return planes
 
 
 def dark_current(of: Generator, bits: np.ndarray) -> np.ndarray:
-    """Return DARK (SIDE, SIDE), e/s: median 0.015, 30% a pixel; hot pixels 1 to 100, their neighbours a tenth."""
+    """Return DARK (y, x), e/s: median 0.015, 30% a pixel; hot pixels 1 to 100, their neighbours a tenth."""
     rng = of("DARK")
-    plane = 0.015 * np.exp(0.3 * rng.standard_normal((SIDE, SIDE), np.float32))
+    plane = 0.015 * np.exp(0.3 * rng.standard_normal(SCA_SHAPE, np.float32))
     hot = bits & HOT > 0
     plane[hot] = 10 ** rng.uniform(0, 2, hot.sum())
     near = (bits & ADJACENT > 0) & ~hot
@@ -120,21 +121,21 @@ def dark_current(of: Generator, bits: np.ndarray) -> np.ndarray:
 
 
 def rate_exponent(of: Generator) -> np.ndarray:
-    """Return CRNL (1, SIDE, SIDE): exponent of the count rate, 0.003 / ln 10 (0.3% a decade) +- 20%."""
+    """Return CRNL (1, y, x): exponent of the count rate, 0.003 / ln 10 (0.3% a decade) +- 20%."""
     rng = of("CRNL")
-    return (0.003 / np.log(10) * (1 + 0.2 * rng.standard_normal((1, SIDE, SIDE), np.float32))).astype(np.float32)
+    return (0.003 / np.log(10) * (1 + 0.2 * rng.standard_normal((1, *SCA_SHAPE), np.float32))).astype(np.float32)
 
 
 def full_well(of: Generator) -> np.ndarray:
-    """Return SATURATE (SIDE, SIDE) int32, electrons: 1.1e5 +- 4%."""
-    return (1.1e5 * (1 + 0.04 * of("SATURATE").standard_normal((SIDE, SIDE), np.float32))).astype(np.int32)
+    """Return SATURATE (y, x) int32, electrons: 1.1e5 +- 4%."""
+    return (1.1e5 * (1 + 0.04 * of("SATURATE").standard_normal(SCA_SHAPE, np.float32))).astype(np.int32)
 
 
 def nonlinearity(of: Generator) -> np.ndarray:
-    """Return CNL (3, SIDE, SIDE) float64: b2, b3, b4 that take 3%, 1% and 0.5% of 1e5 e, 10% a pixel."""
+    """Return CNL (3, y, x) float64: b2, b3, b4 that take 3%, 1% and 0.5% of 1e5 e, 10% a pixel."""
     rng = of("CNL")
     size = np.array([3e-2 / 1e5, 1e-2 / 1e5**2, 5e-3 / 1e5**3])
-    scatter = 1 + 0.1 * rng.standard_normal((3, SIDE, SIDE), np.float32)
+    scatter = 1 + 0.1 * rng.standard_normal((3, *SCA_SHAPE), np.float32)
     return size[:, None, None] * scatter
 
 
@@ -148,15 +149,15 @@ def capacitance(of: Generator) -> np.ndarray:
 
 
 def noise(of: Generator, bits: np.ndarray) -> np.ndarray:
-    """Return READ (3, SIDE, SIDE) float64: reset noise and its scatter, DN; read noise of an exposure, e, 8.5 +- 10%.
+    """Return READ (3, y, x) float64: reset noise and its scatter, DN; read noise of an exposure, e, 8.5 +- 10%.
 
     Noisy pixels have 2 to 10 times the read noise.
     """
     rng = of("READ")
-    planes = np.empty((3, SIDE, SIDE))
-    planes[0] = 20 * (1 + 0.05 * rng.standard_normal((SIDE, SIDE), np.float32))
-    planes[1] = 2 * (1 + 0.05 * rng.standard_normal((SIDE, SIDE), np.float32))
-    planes[2] = 8.5 * np.exp(0.1 * rng.standard_normal((SIDE, SIDE), np.float32))
+    planes = np.empty((3, *SCA_SHAPE))
+    planes[0] = 20 * (1 + 0.05 * rng.standard_normal(SCA_SHAPE, np.float32))
+    planes[1] = 2 * (1 + 0.05 * rng.standard_normal(SCA_SHAPE, np.float32))
+    planes[2] = 8.5 * np.exp(0.1 * rng.standard_normal(SCA_SHAPE, np.float32))
     noisy = bits & NOISY > 0
     planes[2, noisy] *= rng.uniform(2, 10, noisy.sum())
     return planes
@@ -169,15 +170,15 @@ def gain(of: Generator) -> np.ndarray:
 
 
 def bias(of: Generator) -> np.ndarray:
-    """Return BIAS (SIDE, SIDE) uint16, DN: 6700, 150 from channel to channel, 60 from pixel to pixel."""
+    """Return BIAS (y, x) uint16, DN: 6700, 150 from channel to channel, 60 from pixel to pixel."""
     rng = of("BIAS")
-    stripes = np.repeat(rng.normal(6700, 150, CHANNELS), SIDE // CHANNELS)
-    return np.rint(stripes + 60 * rng.standard_normal((SIDE, SIDE), np.float32)).astype(np.uint16)
+    stripes = np.repeat(rng.normal(6700, 150, CHANNELS), SCA_PIXELS // CHANNELS)
+    return np.rint(stripes + 60 * rng.standard_normal(SCA_SHAPE, np.float32)).astype(np.uint16)
 
 
 def _border() -> np.ndarray:
-    edge = np.ones((SIDE, SIDE), bool)
-    edge[BORDER:-BORDER, BORDER:-BORDER] = False
+    edge = np.ones(SCA_SHAPE, bool)
+    edge[REFERENCE_PIXELS:-REFERENCE_PIXELS, REFERENCE_PIXELS:-REFERENCE_PIXELS] = False
     return edge
 
 

@@ -9,7 +9,7 @@ import sep
 
 from romandask.kernels.measurement import psf_fit
 from romandask.kernels.measurement.apertures import blendedness, kron_radii, sums
-from romandask.kernels.measurement.measurement_image import Layer, at
+from romandask.kernels.measurement.measurement_image import MeasurementImage, at
 from romandask.kernels.measurement.peaks import find_peaks
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
@@ -61,7 +61,7 @@ class Found:
 
 
 def detect(
-    layer: Layer, threshold: float, min_area: int, levels: int, contrast: float, min_snr: float
+    layer: MeasurementImage, threshold: float, min_area: int, levels: int, contrast: float, min_snr: float
 ) -> tuple[Found, np.ndarray]:
     """Return the objects of a detection image, with Source Extractor's meaning of the settings, and their map (int32).
 
@@ -94,7 +94,7 @@ def detect(
     return replace(objects, flags=objects.flags | extra), segments
 
 
-def detect_peaks(layer: Layer, threshold: float, min_area: int, min_snr: float) -> tuple[Found, np.ndarray]:
+def detect_peaks(layer: MeasurementImage, threshold: float, min_area: int, min_snr: float) -> tuple[Found, np.ndarray]:
     """Return the objects of a detection image that are peaks of it, smoothed with its PSF, and their map (int32).
 
     Objects that touch are flagged as deblended; `snr` is that of a point source at the peak.
@@ -128,7 +128,7 @@ def _make_room() -> None:
 
 
 def _measured(
-    layer: Layer, found: np.ndarray, segments: np.ndarray, reach: float = REACH, min_snr: float | None = None
+    layer: MeasurementImage, found: np.ndarray, segments: np.ndarray, reach: float = REACH, min_snr: float | None = None
 ) -> Found:
     """Return what is measured of the objects that sep has found, in the order of their numbers in the map.
 
@@ -187,13 +187,17 @@ def select(found: Found, keep: np.ndarray) -> Found:
     return Found(**{name: value[keep] for name, value in vars(found).items()})
 
 
-def kron_fluxes(layer: Layer, segments: np.ndarray, found: Found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def kron_fluxes(
+    layer: MeasurementImage, segments: np.ndarray, found: Found
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flux, error and flags of a band in the apertures of the detection image, neighbours taken out."""
     shape = (found.a, found.b, found.theta, found.kron_radius)
     return ellipse_flux(layer, segments, found.label, found.barycentre_x, found.barycentre_y, *shape)
 
 
-def ellipse_flux(layer: Layer, segments, label, x, y, a, b, theta, r) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def ellipse_flux(
+    layer: MeasurementImage, segments, label, x, y, a, b, theta, r
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flux, error and flags in ellipses of `r` times the semi-axes, neighbours taken out.
 
     The error counts the correlations of the noise: that of white noise times the ratio measured on random apertures of
@@ -207,7 +211,9 @@ def ellipse_flux(layer: Layer, segments, label, x, y, a, b, theta, r) -> tuple[n
     return flux, np.sqrt(correlated**2 + layer.poisson(flux, x, y)), flag | np.where(empty, NO_DATA, 0)
 
 
-def aperture_fluxes(layer: Layer, segments: np.ndarray, found: Found, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def aperture_fluxes(
+    layer: MeasurementImage, segments: np.ndarray, found: Found, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and error of every object in a circle (pixels), corrected to the total light of a point source.
 
     The correction is the share of the PSF image's light inside the circle; no detail of the PSF within it matters.
@@ -224,7 +230,7 @@ def aperture_fluxes(layer: Layer, segments: np.ndarray, found: Found, radius: fl
     return flux / share, error / share
 
 
-def psf_fluxes(layer: Layer, found: Found) -> tuple[np.ndarray, np.ndarray]:
+def psf_fluxes(layer: MeasurementImage, found: Found) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and error of every object as a point source: unweighted fit of the PSF in a window."""
     flux, norm = psf_fit.fit(layer.image, layer.psf, found.x, found.y)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -17,7 +17,7 @@ _SAMPLES = 4_000_000
 
 
 @dataclass(frozen=True)
-class Layer:
+class MeasurementImage:
     """One band of a tile, or its detection image."""
 
     image: np.ndarray

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from romandask.kernels.measurement.convolve import convolve
-from romandask.kernels.measurement.measurement_image import Layer
+from romandask.kernels.measurement.measurement_image import MeasurementImage
 
 KERNEL = 8
 """Half the side of the PSF that is smoothed with, pixels."""
@@ -26,7 +26,7 @@ class Peaks:
     """(n,) True where its pixels touch another's."""
 
 
-def find_peaks(layer: Layer, threshold: float, min_area: int, min_snr: float) -> Peaks:
+def find_peaks(layer: MeasurementImage, threshold: float, min_area: int, min_snr: float) -> Peaks:
     """Return the peaks of the PSF-smoothed image: what Rubin's pipelines detect (Bosch et al. 2018, section 4.7).
 
     Parameters
@@ -48,7 +48,7 @@ def find_peaks(layer: Layer, threshold: float, min_area: int, min_snr: float) ->
     return Peaks(segments, height[kept], _touching(segments, int(kept.sum()))[1:])
 
 
-def point_source_snr(layer: Layer) -> np.ndarray:
+def point_source_snr(layer: MeasurementImage) -> np.ndarray:
     """Return the signal to noise (ny, nx), float32, of a point source at every pixel: the matched filter.
 
     The noise is white but for the factor by which PSF fits scatter more (`Layer.psf_ratio`). Where there is no data

@@ -19,7 +19,7 @@ from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map, strips
 from romandask.kernels.detectors.simple_detector import SATURATED, noise_realisation, usable
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT
-from romandask.products.memory import give_back
+from romandask.products.memory import release_free_memory
 from romandask.stages.coadds.input_psfs import input_psf, psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
 from romandask.stages.exposures import empty_variance
@@ -43,7 +43,7 @@ class DrizzleTile(TileMaker):
         for number, (exposure, frame) in enumerate(zip(exposures, frames, strict=True)):
             if parts[number]:
                 psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
-        give_back()
+        release_free_memory()
         sums, full = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac), []
         for i, exposure, header, frame, part in zip(members, exposures, headers, frames, parts, strict=True):
             planes: Iterable = []
@@ -54,7 +54,7 @@ class DrizzleTile(TileMaker):
                 planes = _planes_of(arrays, maps, instrument, exposure, header, source.seed, self.settings.noise)
             sums.add(planes)
         arrays, planes = {}, []
-        give_back()
+        release_free_memory()
         seconds = np.array([exposure.exptime for exposure in exposures])
         sets = sets_table(sums.set, sums.sets, seconds, [self.exposures.names[i] for i in members])
         members_of = np.array([len(chosen) for chosen in sums.sets], np.uint16)

@@ -18,7 +18,7 @@ from romandask.stages.coadds.drizzled import DrizzleTile
 CHOICES = np.round(np.arange(0.3, 1.001, 0.1), 1)
 UNEVEN = 0.2
 """Rms over median of the weight that is tolerated (Troxel et al. 2023, section 5.1; Fruchter & Hook 2002)."""
-SIDE = 300
+TEST_SQUARE_PIXELS = 300
 """Pixels, a side, of the square in which it is measured."""
 
 
@@ -57,20 +57,20 @@ def coverage(coadds: ImageProduct) -> list[Coverage]:
     instrument, scale = source.instrument, source.instrument.coadd_scale
     totals = [sum(len(maker.members[k, band]) for band in instrument.bands) for k in range(len(maker.tiles))]
     k = int(np.argmax(totals))
-    target = WCS(tangent_header(maker.tiles[k].ra, maker.tiles[k].dec, SIDE, scale))
+    target = WCS(tangent_header(maker.tiles[k].ra, maker.tiles[k].dec, TEST_SQUARE_PIXELS, scale))
     found = []
     for band in instrument.bands:
         seen = []
         for i in maker.members[k, band]:
             exposure = exposure_of(source.table.iloc[i])
             wcs = WCS(instrument.header(exposure))
-            parts = strips(wcs, instrument.shape, target, (SIDE, SIDE))
+            parts = strips(wcs, instrument.shape, target, (TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS))
             if parts:
                 seen.append((exposure.exptime, [pixel_map(wcs, target, part.rows, part.columns) for part in parts]))
         if not seen:
             raise UserError(f"pixfrac: no exposure of {band} on the middle of tile {maker.tiles[k].name}")
         for choice in CHOICES:
-            sums = Sums((SIDE, SIDE), 1, float(choice))
+            sums = Sums((TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS), 1, float(choice))
             for seconds, maps in seen:
                 planes = [np.full(one.shape, seconds, np.float32) for one in maps]
                 sums.add(([plane], plane, one) for plane, one in zip(planes, maps, strict=True))

@@ -16,7 +16,7 @@ from romandask.kernels.detectors.simple_detector import SATURATED, noise_realisa
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.model.tiles import Tile
-from romandask.products.memory import give_back
+from romandask.products.memory import release_free_memory
 from romandask.stages.coadds.input_psfs import jacobian, psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
 from romandask.stages.psf_images import OVERSAMPLING, psf_image
@@ -38,7 +38,7 @@ class WarpTile(TileMaker):
             if weight:
                 psf += weight * _psf(instrument, exposure, target, here.tile)
                 used += weight
-        give_back()
+        release_free_memory()
         scale = np.float32(instrument.coadd_scale**2)
         image, *noise = (plane * scale for plane in sums.means())
         return {

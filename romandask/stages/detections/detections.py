@@ -25,7 +25,7 @@ from romandask.model.sky import Region, cells_in_cone, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
 from romandask.products.hats import with_spatial_index
 from romandask.products.images import ImageProduct
-from romandask.products.memory import give_back
+from romandask.products.memory import release_free_memory
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
@@ -140,7 +140,7 @@ class DetectTile:
         radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
         # a band at a time is in memory
         del combined
-        give_back()
+        release_free_memory()
         wcs = maker.wcs(index)
         ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
         keep = owned(ra, dec, tile, maker.settings.grid(), self.region)

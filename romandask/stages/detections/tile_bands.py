@@ -9,10 +9,17 @@ import numpy as np
 
 from romandask.instruments.instrument import Instrument
 from romandask.kernels.measurement import psf_fit
-from romandask.kernels.measurement.measurement_image import Layer, errors, median, noise_ratios, rms_of, weighted_mean
+from romandask.kernels.measurement.measurement_image import (
+    MeasurementImage,
+    errors,
+    median,
+    noise_ratios,
+    rms_of,
+    weighted_mean,
+)
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.products.images import ImageProduct
-from romandask.products.memory import give_back
+from romandask.products.memory import release_free_memory
 from romandask.stages.coadds.tile_maker import unit_of
 from romandask.storage.arrays import chunk_side
 
@@ -48,7 +55,7 @@ class TileBands:
         found = {name: self.readers[index](name, part) for name, part in windows.items()}
         return {name: plane[0] if name == "noise" else plane for name, plane in found.items()}
 
-    def layer(self, band: str) -> Layer:
+    def layer(self, band: str) -> MeasurementImage:
         """Return one band for photometry: three planes in memory while it is made, two in the end."""
         noise, weight = self.arrays(band, ("noise", "weight")).values()
         rms = rms_of(noise, weight)
@@ -58,15 +65,15 @@ class TileBands:
         spread = psf_fit.scatter(noise, psf, error)
         # before the image is read: the noise has told what it can
         del noise, weight
-        give_back()
+        release_free_memory()
         rate = self.instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT
         exposures = None
         if self.instrument.coadd != "drizzle":
             exposures, rate = self.arrays(band, ("nimages",))["nimages"], rate * VISIT
         image = self.arrays(band, ("image",))["image"]
-        return Layer(image, error, mask, ratios, psf, spread, rate, rms, exposures)
+        return MeasurementImage(image, error, mask, ratios, psf, spread, rate, rms, exposures)
 
-    def detection(self) -> Layer:
+    def detection(self) -> MeasurementImage:
         """Return the detection image: the median of bands, or their mean with inverse variances."""
         bands = self.instrument.detection_bands or self.instrument.bands
         scales, spreads = [], []
@@ -91,7 +98,9 @@ class TileBands:
                 noise[part], _ = weighted_mean([one["noise"] for one in parts], weights, spreads)
         error, mask = errors(total, rms_of(noise, total))
         psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
-        return Layer(image, error, mask, noise_ratios(noise, error, mask), psf, psf_fit.scatter(noise, psf, error))
+        return MeasurementImage(
+            image, error, mask, noise_ratios(noise, error, mask), psf, psf_fit.scatter(noise, psf, error)
+        )
 
 
 def _blocks(shape: tuple[int, int]) -> Iterator[Window]:

@@ -21,10 +21,10 @@ from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.stages.truth.generated import GenerateGalaxies, GenerateStars, NothingSetAside, matter, templates
-from romandask.stages.truth.ingested import Assemble, Quarantine, contents, edges_of, incoming, open_sources
+from romandask.stages.truth.ingested import Assemble, Quarantine, edges_of, ingested_rows, open_sources, scan_rows
 from romandask.storage.arrays import write_coordinate, write_group
 from romandask.storage.manifest import digest
-from romandask.storage.paths import Place, below
+from romandask.storage.paths import AnyPath, resolve_below
 from romandask.storage.store import Store
 
 WIDE = 1e7
@@ -46,7 +46,7 @@ class TruthCatalogs:
     quarantine: TableProduct
     structure: ImageProduct | None
     """Matter of a generated universe."""
-    incoming: TableProduct | None
+    ingested_rows: TableProduct | None
     """Rows of source catalogs."""
     library: SpectrumLibrary
     edges: tuple[float, ...]
@@ -101,7 +101,7 @@ def _rows_near(
 
 def truth(
     settings: TruthSettings,
-    data: Place,
+    data: AnyPath,
     region: Region,
     bandpasses: dict[str, Bandpass],
     seed: int,
@@ -115,7 +115,7 @@ def truth(
     data : folder that the settings' paths are below
     bandpasses : by band; the catalogs hold the flux of every object in each
     store : where units that are there are read from
-    rows : the source catalogs' rows (incoming.incoming); opened here where they are not given
+    rows : the source catalogs' rows (stages.truth.ingested); opened here where they are not given
 
     Raises
     ------
@@ -125,19 +125,19 @@ def truth(
     if settings.source == "generate":
         return _generated(settings, data, region, bandpasses, seed, store)
     if rows is None:
-        rows = _kept(incoming(open_sources(settings, data)), store)
+        rows = _kept(ingested_rows(open_sources(settings, data)), store)
     return _from_sources(settings, data, region, bandpasses, store, rows)
 
 
 def _generated(
     settings: TruthSettings,
-    data: Place,
+    data: AnyPath,
     region: Region,
     bandpasses: dict[str, Bandpass],
     seed: int,
     store: Store | None,
 ) -> TruthCatalogs:
-    spectra = templates(below(data, settings.star_seds) if settings.star_seds else None)
+    spectra = templates(resolve_below(data, settings.star_seds) if settings.star_seds else None)
     cells = region.cells(settings.order, settings.margin)
     field = _kept(matter(settings, region, seed), store)
     common = (settings, region, bandpasses, seed, spectra, cells)
@@ -164,14 +164,14 @@ def _generated(
 
 def _from_sources(
     settings: TruthSettings,
-    data: Place,
+    data: AnyPath,
     region: Region,
     bandpasses: dict[str, Bandpass],
     store: Store | None,
     rows: TableProduct,
 ) -> TruthCatalogs:
-    found = contents(rows, settings.order)
-    folder = below(data, settings.seds or "seds")
+    found = scan_rows(rows, settings.order)
+    folder = resolve_below(data, settings.seds or "seds")
     library, unusable = spectra_files.read_folder(folder, list(found.spectra))
     edges = edges_of(rows)
     # components of a galaxy that lie apart across an edge are each looked at where they are

@@ -22,7 +22,7 @@ from romandask.products.images import ImageProduct
 from romandask.products.units import Unit
 from romandask.storage.arrays import Variable
 from romandask.storage.manifest import digest
-from romandask.storage.paths import Place
+from romandask.storage.paths import AnyPath
 
 _NO_BINS = np.zeros(0, np.float32)
 
@@ -39,7 +39,7 @@ class Templates:
 
 
 @lru_cache(maxsize=4)
-def templates(star_folder: Place | None) -> Templates:
+def templates(star_folder: AnyPath | None) -> Templates:
     """Return the library: galaxy templates, then blackbodies or a folder of stars by their colour temperature.
 
     Raises

@@ -22,13 +22,13 @@ from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.storage.paths import Place, below, reached
+from romandask.storage.paths import AnyPath, access_errors_explained, resolve_below
 
 SPECTRA = ("bulge_sed", "disk_sed", "knots_sed", "sed")
 _BATCH_BYTES = 600 << 20
 
 
-def open_sources(settings: TruthSettings, data: Place) -> tuple[Source, ...]:
+def open_sources(settings: TruthSettings, data: AnyPath) -> tuple[Source, ...]:
     """Return the source catalogs that the settings name, checked.
 
     Raises
@@ -38,20 +38,20 @@ def open_sources(settings: TruthSettings, data: Place) -> tuple[Source, ...]:
     """
     opened = {"skycatalogs": skycatalogs.open_source, "instance_catalog": instance_catalog.open_source}
     if settings.source in opened:
-        place = below(data, str(settings.path))
-        with reached(place):
+        place = resolve_below(data, str(settings.path))
+        with access_errors_explained(place):
             return (opened[settings.source](place),)
     found = []
     for kind, each in (("galaxy", settings.galaxy_table), ("star", settings.star_table)):
         if each is not None:
-            place = below(data, each.path)
-            with reached(place):
+            place = resolve_below(data, each.path)
+            with access_errors_explained(place):
                 found.append(table.open_source(place, dict(each.columns), kind))
     return tuple(found)
 
 
-def incoming(sources: tuple[Source, ...]) -> TableProduct:
-    """Return the rows of source catalogs in their normal form (schema: catalogs/incoming.yaml), a unit a batch."""
+def ingested_rows(sources: tuple[Source, ...]) -> TableProduct:
+    """Return the rows of source catalogs in their normal form (schema: catalogs/ingested.yaml), a unit a batch."""
     pairs = tuple((number, batch) for number, source in enumerate(sources) for batch in source.batches())
     states = [source.state() for source in sources]
     names = [f"{number}-{batch.name}" if len(sources) > 1 else batch.name for number, batch in pairs]
@@ -60,7 +60,7 @@ def incoming(sources: tuple[Source, ...]) -> TableProduct:
         for name, (number, batch) in zip(names, pairs, strict=True)
     )
     return TableProduct(
-        "truth/incoming", units, _ReadBatch(sources, pairs), schema("incoming"), bytes_per_unit=_BATCH_BYTES
+        "truth/ingested", units, _ReadBatch(sources, pairs), schema("ingested"), bytes_per_unit=_BATCH_BYTES
     )
 
 
@@ -78,7 +78,7 @@ class _ReadBatch:
 
 
 def edges_of(rows: TableProduct) -> tuple[float, ...]:
-    """Return the edges, nm, of the top-hat bins of incoming rows; empty where there are none."""
+    """Return the edges, nm, of the top-hat bins of ingested rows; empty where there are none."""
     source: _ReadBatch = rows.make  # type: ignore[assignment]
     return next((each.edges for each in source.sources if each.edges), ())
 
@@ -91,8 +91,8 @@ def source_rows(rows: TableProduct) -> int:
 
 
 @dataclass(frozen=True)
-class Contents:
-    """What a pass over all incoming rows tells."""
+class RowsSummary:
+    """What a pass over all ingested rows tells."""
 
     cells: np.ndarray
     """HEALPix cells with rows."""
@@ -100,8 +100,8 @@ class Contents:
     """Names of spectra, sorted."""
 
 
-def contents(rows: TableProduct, order: int) -> Contents:
-    """Return the cells and the names of spectra of all good incoming rows, a batch at a time."""
+def scan_rows(rows: TableProduct, order: int) -> RowsSummary:
+    """Return the cells and the names of spectra of all good ingested rows, a batch at a time."""
     cells: set[int] = set()
     names: set[str] = set()
     for index in range(len(rows.units)):
@@ -110,12 +110,12 @@ def contents(rows: TableProduct, order: int) -> Contents:
         cells |= set(np.unique(frame["_healpix_29"].to_numpy() >> (2 * (29 - order))).tolist())
         for column in SPECTRA:
             names |= set(frame[column].unique().tolist())
-    return Contents(np.array(sorted(cells), np.int64), tuple(sorted(names - {""})))
+    return RowsSummary(np.array(sorted(cells), np.int64), tuple(sorted(names - {""})))
 
 
 @dataclass(frozen=True)
 class Assemble:
-    """Makes the truth catalogs' partitions of incoming rows."""
+    """Makes the truth catalogs' partitions of ingested rows."""
 
     settings: TruthSettings
     region: Region

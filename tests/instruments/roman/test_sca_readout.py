@@ -11,7 +11,7 @@ from conftest import MINI, command
 from PIL import Image
 
 from romandask.engine.task import Task
-from romandask.engine.task_queue import Waiting
+from romandask.engine.task_queue import TaskQueue
 from romandask.instruments.instrument import Exposure
 from romandask.instruments.roman.sca_effects import differences
 from romandask.instruments.roman.sca_readout import DAY, age, before
@@ -90,12 +90,12 @@ def test_tasks_follow_those_they_come_after():
         Task(2, "", 5.0, "a", (1,)),
         Task(3, "", 1.0, "c", (0,)),
     ]
-    waiting = Waiting(tasks)
+    waiting = TaskQueue(tasks)
     order = []
     while waiting:
         order.append(waiting.next().index)
     assert order == [0, 3, 1, 2]
-    waiting = Waiting(tasks)
+    waiting = TaskQueue(tasks)
     waiting.next()
     assert [task.index for task in waiting.give_up(0)] == [3, 1, 2]
     assert not waiting

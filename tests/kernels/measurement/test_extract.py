@@ -22,7 +22,14 @@ from romandask.kernels.measurement.extract import (
     kron_fluxes,
     psf_fluxes,
 )
-from romandask.kernels.measurement.measurement_image import Layer, errors, median, noise_ratios, rms_of, weighted_mean
+from romandask.kernels.measurement.measurement_image import (
+    MeasurementImage,
+    errors,
+    median,
+    noise_ratios,
+    rms_of,
+    weighted_mean,
+)
 
 SIDE, SEXTRACTOR = 1000, Path("/usr/share/source-extractor")
 
@@ -44,15 +51,15 @@ def field(seed: int = 3, count: int = 900) -> np.ndarray:
     return ndimage.gaussian_filter(image, 1.3)
 
 
-def layer_of(image: np.ndarray, noise: np.ndarray, weight: np.ndarray) -> Layer:
+def layer_of(image: np.ndarray, noise: np.ndarray, weight: np.ndarray) -> MeasurementImage:
     error, mask = errors(weight.astype(np.float32), rms_of(noise, weight))
     psf = np.zeros((41, 41), np.float32)
     psf[20, 20] = 1
-    return Layer(image, error, mask, noise_ratios(noise, error, mask), ndimage.gaussian_filter(psf, 1.3))
+    return MeasurementImage(image, error, mask, noise_ratios(noise, error, mask), ndimage.gaussian_filter(psf, 1.3))
 
 
 @pytest.fixture(scope="module")
-def noisy() -> Layer:
+def noisy() -> MeasurementImage:
     random = np.random.default_rng(1)
     image = field() + random.normal(0, 1, (SIDE, SIDE)).astype(np.float32)
     return layer_of(image, random.normal(0, 1, (SIDE, SIDE)).astype(np.float32), np.ones((SIDE, SIDE)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from romandask.kernels.measurement.extract import detect_peaks
-from romandask.kernels.measurement.measurement_image import Layer
+from romandask.kernels.measurement.measurement_image import MeasurementImage
 from romandask.kernels.measurement.peaks import KERNEL, find_peaks, point_source_snr
 from romandask.model.seeds import rng
 
@@ -15,10 +15,10 @@ PSF = galsim.Convolve(galsim.Kolmogorov(fwhm=3.5), galsim.Pixel(1.0)).drawImage(
 RMS = 2.0
 
 
-def layer(image: np.ndarray, mask: np.ndarray | None = None, ratio: float = 1.0) -> Layer:
+def layer(image: np.ndarray, mask: np.ndarray | None = None, ratio: float = 1.0) -> MeasurementImage:
     mask = np.zeros(image.shape, bool) if mask is None else mask
     error = np.where(mask, 0, RMS).astype(np.float32)
-    return Layer(image.astype(np.float32), error, mask, np.ones(10), PSF.array, ratio)
+    return MeasurementImage(image.astype(np.float32), error, mask, np.ones(10), PSF.array, ratio)
 
 
 def stars(shape, places, fluxes) -> np.ndarray:

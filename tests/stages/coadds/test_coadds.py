@@ -21,7 +21,7 @@ from romandask.model.errors import UserError
 from romandask.model.tiles import tangent_header
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.coadds.drizzled import saturated_places
-from romandask.stages.coadds.pixfrac import CHOICES, SIDE, advice, coverage
+from romandask.stages.coadds.pixfrac import CHOICES, TEST_SQUARE_PIXELS, advice, coverage
 from romandask.stages.exposures import RenderExposure, wcs_of
 from romandask.storage.store import Store
 
@@ -174,8 +174,8 @@ def test_pixfrac_is_advised_from_the_weights_that_the_package_gives(small):
     assert all(first.empty >= second.empty for first, second in itertools.pairwise(found))
     one = found[4]
     k = int(np.argmax([len(product.make.members[k, "H158"]) for k in range(len(small.tiles))]))
-    target = WCS(tangent_header(small.tiles[k].ra, small.tiles[k].dec, SIDE, 0.0575))
-    oracle = Drizzle(kernel="square", fillval="0", out_shape=(SIDE, SIDE), disable_ctx=True)
+    target = WCS(tangent_header(small.tiles[k].ra, small.tiles[k].dec, TEST_SQUARE_PIXELS, 0.0575))
+    oracle = Drizzle(kernel="square", fillval="0", out_shape=(TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS), disable_ctx=True)
     for exposure in small.exposures:
         whole = pixel_map(WCS(small.roman.header(exposure)), target, slice(0, 300), slice(0, 300)).dense()
         plane = np.ones(small.roman.shape, np.float32)

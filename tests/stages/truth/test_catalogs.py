@@ -29,8 +29,8 @@ from romandask.pipeline import pipeline_of
 from romandask.products.hats import WIDTH, margin, write_catalog_files
 from romandask.run import ingest
 from romandask.stage_graph import stages
-from romandask.stages.truth import ingested as incoming
 from romandask.stages.truth.catalogs import truth
+from romandask.stages.truth.ingested import _ReadBatch
 from romandask.storage.store import Store
 from romandask.survey import Survey
 
@@ -190,15 +190,15 @@ def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
 
 def test_a_source_is_read_once(tmp_path, shared, monkeypatch):
     """What truth there is its rows tell, those in the store: not a second pass over the files."""
-    read, batch = [], incoming._ReadBatch.__call__
+    read, batch = [], _ReadBatch.__call__
 
     def counted(maker, index):
         read.append(index)
         return batch(maker, index)
 
-    monkeypatch.setattr(incoming._ReadBatch, "__call__", counted)
+    monkeypatch.setattr(_ReadBatch, "__call__", counted)
     _, survey = ingested(tmp_path, shared, {"source": "skycatalogs", "path": "skycatalogs_sample"})
-    assert sorted(read) == list(range(len(survey.incoming_product.units)))
+    assert sorted(read) == list(range(len(survey.ingested_product.units)))
 
 
 def ingested(tmp_path, shared, settings, seds="seds"):
@@ -349,7 +349,7 @@ def test_stages_of_a_source_begin_with_its_rows(shared):
     }
     names = [stage.name for stage in stages(Survey(pipeline_of(content, "test")))]
     assert names[:5] == [
-        "truth/incoming",
+        "truth/ingested",
         "truth/galaxies",
         "truth/galaxies_margin",
         "truth/stars",

@@ -12,7 +12,8 @@ from romandask.stages.analysis.blend_statistics import statistics
 from romandask.stages.analysis.friends_of_friends import matches
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.cutouts import cutouts
-from romandask.stages.detections.detections import detections, objects
+from romandask.stages.detections.detections import detections
+from romandask.stages.detections.objects import objects
 from romandask.stages.exposures import exposures
 from romandask.stages.pointings import pointings
 from romandask.stages.psf_images import psfs

@@ -66,6 +66,12 @@ class Pipeline(Section):
             found["rubin"] = Rubin(self.rubin, self.render.n_waves, seed=self.seed)
         return found
 
+    def block(self, survey: str) -> RomanSettings | RubinSettings:
+        """Return the block of an instrument."""
+        found: RomanSettings | RubinSettings | None = {"roman": self.roman, "rubin": self.rubin}[survey]
+        assert found is not None
+        return found
+
     def calibration(self) -> CalibrationSource | None:
         """Return where the calibrations of Roman's SCAs come from; None where they have none."""
         if self.roman is None or self.roman.detector == "simple":

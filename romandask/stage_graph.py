@@ -1,44 +1,184 @@
-"""The stages of a survey, each after those that it is made from, and the plan: what each needs a unit."""
+"""The stages of a survey: their declarations in order, the products that a survey has of them, and what each reads."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
+from functools import partial
 
 from romandask.model.errors import UserError
 from romandask.products.hats import margin
-from romandask.products.images import ImageProduct
-from romandask.products.memory import INTERPRETER
 from romandask.products.tables import TableProduct
+from romandask.stages.analysis.blend_statistics import STATISTICS
+from romandask.stages.analysis.differences import DIFFERENCES
+from romandask.stages.analysis.friends_of_friends import CHANCE, MATCHES
+from romandask.stages.analysis.samples import LIMITS, SAMPLES
+from romandask.stages.analysis.shear import SHAPES, SHEAR, SHEAR_PAIRS
+from romandask.stages.calibration import CALIBRATION
+from romandask.stages.coadds.coadds import COADDS
+from romandask.stages.detections.detections import DETECTIONS
+from romandask.stages.detections.objects import OBJECTS
+from romandask.stages.detections.truth_match import TRUTH_MATCH, TRUTH_SUMMARY
+from romandask.stages.detections.zero_points import ZERO_POINTS
+from romandask.stages.exposures import EXPOSURES
+from romandask.stages.pointings import POINTINGS
+from romandask.stages.psf_images import PSF_IMAGES
+from romandask.stages.stage import Stage, SurveyContext
+from romandask.stages.truth.catalogs import GALAXIES, INGESTED, QUARANTINE, STARS, STRUCTURE
+from romandask.stages.truth_index import TRUTH_INDEX
 from romandask.storage.store import MARGIN
-from romandask.survey import Survey
 
-Product = ImageProduct | TableProduct
+STAGES: tuple[Stage, ...] = (
+    STRUCTURE,
+    INGESTED,
+    GALAXIES,
+    STARS,
+    QUARANTINE,
+    POINTINGS,
+    CALIBRATION,
+    EXPOSURES,
+    COADDS,
+    DETECTIONS,
+    TRUTH_MATCH,
+    TRUTH_SUMMARY,
+    ZERO_POINTS,
+    OBJECTS,
+    LIMITS,
+    SAMPLES,
+    DIFFERENCES,
+    SHAPES,
+    SHEAR_PAIRS,
+    SHEAR,
+    *MATCHES,
+    *CHANCE,
+    *STATISTICS,
+    # no stage reads it: it runs where other stages leave workers free
+    TRUTH_INDEX,
+    PSF_IMAGES,
+)
+"""Each stage after those that it reads. A new stage is one line here."""
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage: the product that it stores."""
+class StageProduct:
+    """One product that a survey has of a stage."""
 
     name: str
-    product: Callable[[Survey], Product]
-    position: tuple[str, str] | None = None
-    """Columns of right ascension and declination where the product is a HATS catalog."""
+    """For example `coadds/roman`; also its place in the store."""
+    stage: Stage
+    survey: str
+    """Empty where the stage is not per survey."""
+    reads: frozenset[str]
+    """Names of the products whose units its units are made from."""
+    known_after: frozenset[str]
+    """Names of the products whose content decides which units it has."""
+
+    @property
+    def kind(self) -> str:
+        """First part of the name: `truth`, `coadds`, `matches`."""
+        return self.name.split("/")[0]
+
+
+def with_margins(stages: tuple[Stage, ...]) -> list[Stage]:
+    """Return stages, each catalog followed by the stage of its margin."""
+    found = []
+    for stage in stages:
+        found.append(stage)
+        if stage.sky is not None:
+            found.append(
+                replace(
+                    stage,
+                    name=stage.name + MARGIN,
+                    build=partial(_margin_of, stage),
+                    unit=f"{stage.unit}, margin",
+                    summary="Rows of other partitions within 10 arcsec of each partition.",
+                    reads=(stage.name,),
+                    finish=None,
+                    tables={},
+                )
+            )
+    return found
+
+
+def _margin_of(stage: Stage, context: SurveyContext, survey: str) -> TableProduct:
+    return margin(context.output(product_name(stage, survey)).product)
+
+
+def product_name(stage: Stage, survey: str) -> str:
+    """Return the name of the product of a stage for a survey (the empty string for a stage that is not per survey)."""
+    if not stage.per_survey:
+        return stage.name
+    name = stage.name.removesuffix(MARGIN)
+    return f"{name}/{survey}" + (MARGIN if stage.name.endswith(MARGIN) else "")
+
+
+EVERY_STAGE: tuple[Stage, ...] = tuple(with_margins(STAGES))
+"""The declared stages and those of margins."""
+
+
+def find_stage(name: str, surveys: tuple[str, ...]) -> tuple[Stage, str]:
+    """Return the stage of a product and the survey that the product belongs to.
+
+    Raises
+    ------
+    UserError
+        If no stage has a product of that name.
+    """
+    for stage in EVERY_STAGE:
+        for survey in surveys if stage.per_survey else ("",):
+            if product_name(stage, survey) == name:
+                return stage, survey
+    raise UserError(f"{name!r}: this survey has {', '.join(surveys)}")
+
+
+def stage_products(context: SurveyContext) -> list[StageProduct]:
+    """Return the products that a run of a survey stores, each after those that it is made from."""
+    surveys = tuple(context.instruments)
+    present = [
+        (stage, survey)
+        for stage in EVERY_STAGE
+        if not stage.on_demand
+        for survey in (surveys if stage.per_survey else ("",))
+        if stage.exists(context, survey)
+    ]
+    names = {product_name(stage, survey) for stage, survey in present}
+    return [
+        StageProduct(
+            product_name(stage, survey),
+            stage,
+            survey,
+            frozenset(_resolved(stage.reads, stage, survey, surveys)) & names,
+            frozenset(_resolved(stage.units_known_after, stage, survey, surveys)) & names,
+        )
+        for stage, survey in present
+    ]
+
+
+def _resolved(names: tuple[str, ...], reader: Stage, survey: str, surveys: tuple[str, ...]) -> set[str]:
+    """Return the products that the names of stages in a declaration stand for."""
+    found = set()
+    for name in names:
+        every, stage = name.endswith("/*"), _BY_NAME[name.removesuffix("/*")]
+        if stage.per_survey and (every or not reader.per_survey):
+            found |= {product_name(stage, one) for one in surveys}
+        else:
+            found.add(product_name(stage, survey))
+    return found
+
+
+_BY_NAME = {stage.name: stage for stage in EVERY_STAGE}
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """Some of the stages."""
+class Selection:
+    """Some of the stages, as a user names them."""
 
     only: tuple[str, ...] = ()
-    """Names (coadds/roman) or kinds (coadds) of stages; none for all."""
+    """Names (`coadds/roman`) or kinds (`coadds`) of products; none for all."""
     start: str | None = None
     """The first of them, in the order of the plan."""
 
-    def of(self, every: list[Stage]) -> list[Stage]:
-        """Return the chosen ones, in order.
+    def of(self, products: list[StageProduct]) -> list[StageProduct]:
+        """Return the selected products, in order.
 
         Raises
         ------
@@ -46,159 +186,13 @@ class Chosen:
             If the survey has no such stage.
         """
         for name in (*self.only, *((self.start,) if self.start else ())):
-            if not any(_is(stage, name) for stage in every):
-                kinds = ", ".join(dict.fromkeys(stage.name.split("/")[0] for stage in every))
+            if not any(_is(product, name) for product in products):
+                kinds = ", ".join(dict.fromkeys(product.kind for product in products))
                 raise UserError(f"stage {name!r}: this survey has {kinds}, each followed by /<survey> or /<part>")
-        first = next((k for k, stage in enumerate(every) if self.start and _is(stage, self.start)), 0)
-        return [stage for stage in every[first:] if not self.only or any(_is(stage, name) for name in self.only)]
+        first = next((k for k, product in enumerate(products) if self.start and _is(product, self.start)), 0)
+        chosen = products[first:]
+        return [one for one in chosen if not self.only or any(_is(one, name) for name in self.only)]
 
 
-def tier(stage: str) -> int:
-    """Return the tier of a stage, 0 to 2: none is put together before those of an earlier one have ended.
-
-    What they leave tells which units it has: source rows (0) those of truth and pointings (1), these those of all
-    others (2).
-    """
-    if stage == "truth/ingested":
-        return 0
-    return 1 if stage.startswith(("truth/", "pointings/")) else 2
-
-
-def reads(product: Product) -> frozenset[str]:
-    """Return the names of the stages whose units those of a product are made from."""
-    return frozenset(stage for unit in product.units for stage, _ in (*unit.inputs, *unit.optional))
-
-
-def _is(stage: Stage, name: str) -> bool:
-    return name in (stage.name, stage.name.split("/")[0])
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A row of the plan."""
-
-    stage: str
-    units: int
-    bytes: int
-    """Uncompressed size of the images; 0 where it depends on what is found."""
-    memory: int
-    """Peak of a worker, bytes."""
-    hours: float
-    """Of one core, as measured on a laptop."""
-
-
-_SETTING = {
-    "coadds": "lower coadds.pixels",
-    "detections": "lower coadds.pixels",
-    "truth/structure": "lower truth.nside",
-    "truth": "raise truth.order",
-    "objects": "raise detections.order",
-    "differences": "lower coadds.pixels",
-    "matches": "raise matches.order",
-    "chance": "raise matches.order",
-    "samples": "raise detections.order",
-    "exposures": "lower render.largest",
-    "truth_index": "lower render.largest",
-}
-"""What makes the units of a stage smaller."""
-
-
-def stages(survey: Survey) -> list[Stage]:
-    """Return the stages of a survey, each after those that it is made from; the earlier one's units go first."""
-    names = list(survey.instruments)
-    found = [_first(survey)]
-    found += _with_margin("truth/galaxies", lambda s: s.truth_catalogs.galaxies, ("ra", "dec"))
-    found += _with_margin("truth/stars", lambda s: s.truth_catalogs.stars, ("ra", "dec"))
-    found.append(Stage("truth/quarantine", lambda s: s.truth_catalogs.quarantine))
-    found += [Stage(f"pointings/{name}", lambda s, name=name: s.pointing_product(name)) for name in names]
-    if survey.pipeline.calibration() is not None:
-        found.append(Stage("calibration/roman", lambda s: s.calibration_product))
-    found += [
-        Stage(f"exposures/{name}", lambda s, name=name: s.exposure_product(name))
-        for name, instrument in survey.instruments.items()
-        if instrument.coadd != "draw"
-    ]
-    for kind in ("coadd", "detection"):
-        found += [
-            Stage(f"{kind}s/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
-            for name in names
-        ]
-    for kind in ("truth_match", "truth_summary", "zero_points"):
-        found += [
-            Stage(f"{kind}/{name}", lambda s, kind=kind, name=name: getattr(s, f"{kind}_product")(name))
-            for name in names
-        ]
-    for name in names:
-        found += _with_margin(f"objects/{name}", lambda s, name=name: s.object_product(name), ("coord_ra", "coord_dec"))
-    for name in names:
-        found.append(Stage(f"limits/{name}", lambda s, name=name: s.limit_product(name)))
-        sample = f"samples/{name}"
-        found += _with_margin(sample, lambda s, name=name: s.sample_product(name), ("coord_ra", "coord_dec"))
-    if survey.differs:
-        found.append(Stage("differences/rubin", lambda s: s.difference_product))
-    for part, stage in (("shapes", "shapes"), ("pairs", "shear_pairs"), ("shear", "shear")):
-        found += [
-            Stage(f"{stage}/{name}", lambda s, part=part, name=name: getattr(s.lensing_products(name), part))
-            for name in names
-        ]
-    if {"roman", "rubin"} <= set(names):
-        for kind, products in (("matches", "match_products"), ("chance", "chance_products")):
-            found += [
-                Stage(f"{kind}/{part}", lambda s, products=products, part=part: getattr(getattr(s, products), part))
-                for part in ("local", "crossing", "merged")
-            ]
-            groups = f"{kind}/groups"
-            found += _with_margin(groups, lambda s, p=products: getattr(s, p).groups, ("coord_ra", "coord_dec"))
-        found += [
-            Stage(f"statistics/{part}", lambda s, part=part: getattr(s.statistic_products, part))
-            for part in ("blends", "unrecognised", "distributions", "chance")
-        ]
-    # nothing waits for it: it is made where other stages leave workers free
-    found += [
-        Stage(f"truth_index/{name}", lambda s, name=name: s.truth_index_product(name))
-        for name, instrument in survey.instruments.items()
-        if instrument.coadd != "draw"
-    ]
-    return found
-
-
-def _first(survey: Survey) -> Stage:
-    if survey.pipeline.truth.source == "generate":
-        return Stage("truth/structure", lambda s: s.truth_catalogs.structure)
-    return Stage("truth/ingested", lambda s: s.ingested_product)
-
-
-def _with_margin(name: str, product: Callable[[Survey], TableProduct], position: tuple[str, str]) -> list[Stage]:
-    """Return the stages of a HATS collection: the catalog, then its margin."""
-    return [
-        Stage(name, product, position),  # type: ignore[arg-type]
-        Stage(name + MARGIN, lambda s: margin(product(s)), position),
-    ]
-
-
-def plan(survey: Survey) -> list[Planned]:
-    """Return units, bytes and peak memory of every stage, making nothing but the pointings.
-
-    Raises
-    ------
-    UserError
-        Where a unit does not fit the memory of a worker, or an input is not what it should be.
-    """
-    limit = survey.pipeline.run.memory_limit
-    rows = []
-    for stage in stages(survey):
-        product = stage.product(survey)
-        memory = product.bytes_per_unit + INTERPRETER
-        if memory > limit * 2**30 and product.units:
-            setting = _SETTING.get(stage.name, _SETTING.get(stage.name.split("/")[0], "the size of the survey"))
-            raise UserError(
-                f"{stage.name} {product.names[0]} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
-                f"{setting}, or raise run.memory_limit"
-            )
-        size = 0
-        if isinstance(product, ImageProduct):
-            one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in product.variables)
-            size = one * len(product.units)
-        hours = len(product.units) * product.seconds_per_unit / 3600
-        rows.append(Planned(stage.name, len(product.units), size, memory, hours))
-    return rows
+def _is(product: StageProduct, name: str) -> bool:
+    return name in (product.name, product.kind)

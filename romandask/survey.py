@@ -1,41 +1,135 @@
-"""A survey: a pipeline and a store; its products by name, lazy, read where they are stored and made where not."""
+"""A survey: a pipeline and a store, and its lazy products, read where they are stored and made where they are not."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Literal, TypeVar
 
 import dask.dataframe as dd
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from romandask.instruments.instrument import Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
-from romandask.pipeline import load_pipeline
+from romandask.model.spectra import Bandpass
+from romandask.model.tiles import Tile
+from romandask.pipeline import Pipeline, load_pipeline
+from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
-from romandask.stages.analysis.blend_statistics import Statistics, matrix
-from romandask.stages.analysis.friends_of_friends import group_of
+from romandask.stage_graph import find_stage, stage_products
+from romandask.stages.analysis.blend_statistics import Statistics, matrix, statistics_of
+from romandask.stages.analysis.friends_of_friends import group_of, matches_of
 from romandask.stages.analysis.validation import depths, residuals, with_truth
 from romandask.stages.coadds.psf_at import Spectrum, coadd_psf
 from romandask.stages.cutouts import Positions, Wanted, cutouts, located
 from romandask.stages.detections.truth_match import completeness, reference_band
 from romandask.stages.detections.zero_points import FLUXES
 from romandask.stages.pointings import visits
+from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
 from romandask.storage.manifest import read_records
 from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 from romandask.storage.store import Store
-from romandask.survey_products import SurveyProducts
+
+Value = TypeVar("Value")
 
 
-class Survey(SurveyProducts):
-    """The products of one survey, as its users ask for them.
+class Survey:
+    """The products of one survey.
 
     Parameters
     ----------
-    pipeline : its settings
-    store : where its units are kept; None to make everything on demand
+    pipeline : Pipeline
+        Its settings.
+    store : Store or None
+        Where its units are kept; None to make everything on demand.
     """
+
+    def __init__(self, pipeline: Pipeline, store: Store | None = None):
+        self.pipeline = pipeline
+        self.store = store
+        self._outputs: dict[str, Any] = {}
+        self._shared: dict[tuple[Callable[..., Any], tuple[str, ...]], Any] = {}
+        self._pointings: dict[str, pd.DataFrame] = {}
+        self._not_from_store: set[str] = set()
+
+    @cached_property
+    def region(self) -> Region:
+        """The box on the sky."""
+        return self.pipeline.region.region()
+
+    @cached_property
+    def instruments(self) -> dict[str, Instrument]:
+        """Instruments by survey name."""
+        return self.pipeline.instruments()
+
+    @cached_property
+    def tiles(self) -> list[Tile]:
+        """The tiles whose unique areas touch the region."""
+        return self.pipeline.coadds.grid().covering(self.region)
+
+    @cached_property
+    def bandpasses(self) -> dict[str, Bandpass]:
+        """All bands of all instruments; the truth holds a flux for each."""
+        return {
+            band: instrument.bandpass(band) for instrument in self.instruments.values() for band in instrument.bands
+        }
+
+    @property
+    def data(self) -> AnyPath:
+        """The folder that the paths of source files are relative to."""
+        return parse_path(self.pipeline.data, "data")
+
+    def output(self, name: str) -> Any:
+        """Return what the stage of a product builds, for example of `coadds/roman`; with a store it reads units there.
+
+        Raises
+        ------
+        UserError
+            If the survey has no such product.
+        """
+        if name not in self._outputs:
+            stage, survey = find_stage(name, tuple(self.instruments))
+            built = stage.build(self, survey)
+            made_anew = stage.on_demand or name in self._not_from_store
+            self._outputs[name] = built if self.store is None or made_anew else built.stored(self.store)
+        return self._outputs[name]
+
+    def product(self, name: str) -> Any:
+        """Return the lazy product, an ImageProduct or a TableProduct, of that name."""
+        return self.output(name).product
+
+    def once(self, build: Callable[..., Value], *arguments: str) -> Value:
+        """Return `build(survey, *arguments)`, called once: for values that several stages share."""
+        if (build, arguments) not in self._shared:
+            self._shared[build, arguments] = build(self, *arguments)
+        return self._shared[build, arguments]
+
+    def ignore_stored(self, name: str) -> None:
+        """Make a product anew, whatever the store has of it: what is stored is stale, and others depend on its content.
+
+        Call it before products that depend on it are built.
+        """
+        self._not_from_store.add(name)
+        self._outputs.pop(name, None)
+
+    def use_stored(self, name: str) -> None:
+        """Read a product from the store again, where it has just been made."""
+        if name not in self._not_from_store:
+            return
+        self._not_from_store.discard(name)
+        self._outputs.pop(name, None)
+        if any(name in one.reads for one in stage_products(self)):
+            # what was built with the product reads its units: from now on from the store
+            self._outputs.clear()
+            self._shared.clear()
+
+    @property
+    def truth_catalogs(self) -> TruthCatalogs:
+        """The truth catalogs and the spectra that they refer to."""
+        return self.once(truth_of)
 
     def truth(self, kind: str, region: Region | Cone | None = None) -> dd.DataFrame:
         """Return the lazy truth catalog `galaxies` or `stars` (schema: catalogs/<kind>.yaml).
@@ -48,28 +142,31 @@ class Survey(SurveyProducts):
 
     def pointings(self, survey: str) -> pd.DataFrame:
         """Return the exposures of an instrument, one row a visit and detector."""
-        return self._once("pointings", survey, lambda: self._read_pointings(survey))
+        self._instrument(survey)
+        if survey not in self._pointings:
+            self._pointings[survey] = self.product(f"pointings/{survey}").load(0)
+        return self._pointings[survey]
 
     def visits(self, survey: str) -> pd.DataFrame:
         """Return all visits of an instrument's observing sequence, whether or not they touch the region."""
         settings = self.pipeline
         instrument = self._instrument(survey)
-        return visits(instrument, getattr(settings, survey).pointings, self.data, self.region, settings.seed)
+        return visits(instrument, settings.block(survey).pointings, self.data, self.region, settings.seed)
 
     def exposures(self, survey: str) -> xr.Dataset:
         """Return lazy exposures (exposure, y, x): image, truth, dq; coords visit, detector, band, mjd, header ...
 
         Of Rubin, and of Roman with detector: sca, also raw and variance, and the image is the calibrated one.
         """
-        return self.exposure_product(survey).dataset
+        return self._of("exposures", survey).dataset
 
     def truth_index(self, survey: str) -> dd.DataFrame:
         """Return the lazy index of the objects on each exposure (schema: catalogs/truth_index.yaml)."""
-        return self.truth_index_product(survey).frame
+        return self._of("truth_index", survey).frame
 
     def psfs(self, survey: str) -> xr.Dataset:
         """Return lazy PSF images (exposure, v, u): a unit star of flat f_nu, sampled 8 times finer than pixels."""
-        return self.psf_product(survey).dataset
+        return self._of("psfs", survey).dataset
 
     def cutouts(
         self,
@@ -97,10 +194,12 @@ class Survey(SurveyProducts):
             If an id is not in the catalog, or a name is not one of the above.
         """
         found = located(of, self.tables(catalog), catalog)
-        kinds = {"exposures": self.exposure_product, "coadds": self.coadd_product}
-        product = self._one(kinds, images, tuple(kinds))(survey)
-        layers, bands = ((names,) if isinstance(names, str) else names for names in (layers, bands))
-        return cutouts(product, found, tuple(layers), None if bands is None else tuple(bands), size)
+        if images not in ("exposures", "coadds"):
+            raise UserError(f"{images!r}: this survey has exposures, coadds")
+        product = self._of(images, survey)
+        wanted = (layers,) if isinstance(layers, str) else tuple(layers)
+        chosen = (bands,) if isinstance(bands, str) else bands
+        return cutouts(product, found, wanted, None if chosen is None else tuple(chosen), size)
 
     def tables(self, catalog: str) -> tuple[Positions, ...]:
         """Return the tables that hold the objects of a catalog: truth, or an instrument's."""
@@ -109,11 +208,11 @@ class Survey(SurveyProducts):
             return Positions(truth.galaxies, "galaxy_id", "ra", "dec"), Positions(truth.stars, "id", "ra", "dec")
         if catalog not in self.instruments:
             raise UserError(f"catalog {catalog!r}: this survey has truth, {', '.join(self.instruments)}")
-        return (Positions(self.object_product(catalog), "objectId", "coord_ra", "coord_dec"),)
+        return (Positions(self._of("objects", catalog), "objectId", "coord_ra", "coord_dec"),)
 
     def coadds(self, survey: str) -> xr.Dataset:
         """Return lazy coadds (tile, band, y, x): image, weight, noise, nimages, set, psf ...; coords tile, band, ..."""
-        return self.coadd_product(survey).dataset
+        return self._of("coadds", survey).dataset
 
     def psf(
         self,
@@ -128,11 +227,11 @@ class Survey(SurveyProducts):
 
         It is as the coadd has it there, or, with a scale, sampled every so many arcsec with the star in the middle.
         """
-        return coadd_psf(self.coadd_product("roman"), ra, dec, band, stamp, scale, spectrum)
+        return coadd_psf(self._of("coadds", "roman"), ra, dec, band, stamp, scale, spectrum)
 
     def segmentation(self, survey: str) -> xr.Dataset:
         """Return the lazy maps of detected objects (tile, y, x): `segmentation`, the last 24 bits of objectId."""
-        return self.detection_product(survey).dataset
+        return self._of("detections", survey).dataset
 
     def differences(self) -> xr.Dataset:
         """Return the lazy differences (tile, y, x) of Rubin's tiles and Roman's: difference, template, rms, nJy.
@@ -142,34 +241,34 @@ class Survey(SurveyProducts):
         UserError
             If the survey does not have both bands (`differences.template` and `differences.science`).
         """
-        return self.difference_product.dataset
+        return self._difference_product().dataset
 
     def difference_residuals(self) -> pd.DataFrame:
         """Return what is left of bright objects in the differences (schema: catalogs/residuals.yaml)."""
-        product = self.difference_product
+        product = self._difference_product()
         return pd.concat([product.load(k, ("residuals",))["residuals"] for k in range(len(product.units))])
 
     def truth_match(self, survey: str) -> dd.DataFrame:
         """Return the lazy true counterparts of a survey's objects (schema: catalogs/truth_match.yaml)."""
-        return self.truth_match_product(survey).frame
+        return self._of("truth_match", survey).frame
 
     def truth_summary(self, survey: str) -> dd.DataFrame:
         """Return the lazy list of true objects, found or not (schema: catalogs/truth_summary.yaml)."""
-        return self.truth_summary_product(survey).frame
+        return self._of("truth_summary", survey).frame
 
     def completeness(self, survey: str) -> pd.DataFrame:
         """Return completeness and purity of a survey's objects by magnitude, in H158 of Roman or i of Rubin."""
-        tables = self.truth_summary_product(survey), self.truth_match_product(survey)
-        return completeness(*(table.all_rows() for table in tables), reference_band(self._instrument(survey)))
+        summary, matched = (self._of(stage, survey).all_rows() for stage in ("truth_summary", "truth_match"))
+        return completeness(summary, matched, reference_band(self._instrument(survey)))
 
     def objects_with_truth(self, survey: str) -> pd.DataFrame:
         """Return a survey's objects beside their true counterparts: flux_<band> (nJy), star, redshift, truth_id."""
-        tables = self.object_product, self.truth_match_product, self.truth_summary_product
-        return with_truth(*(table(survey).all_rows() for table in tables))
+        stages = ("objects", "truth_match", "truth_summary")
+        return with_truth(*(self._of(stage, survey).all_rows() for stage in stages))
 
     def depths(self, survey: str) -> pd.Series:
         """Return the 5-sigma depths of point sources, AB mag by band."""
-        return depths(self.object_product(survey).all_rows(), self.bands(survey))
+        return depths(self._of("objects", survey).all_rows(), self.bands(survey))
 
     def residuals(self, survey: str, flux: str = "kronFlux") -> pd.DataFrame:
         """Return bias, scatter and pulls of measured fluxes by band and magnitude (`stages.analysis.validation`)."""
@@ -183,11 +282,11 @@ class Survey(SurveyProducts):
 
     def objects(self, survey: str) -> dd.DataFrame:
         """Return the lazy object table of a survey (schema: catalogs/objects.yaml)."""
-        return self.object_product(survey).frame
+        return self._of("objects", survey).frame
 
     def sample(self, survey: str) -> dd.DataFrame:
         """Return the lazy sample of a survey's objects that the groups are made of (schema: catalogs/samples.yaml)."""
-        return self.sample_product(survey).frame
+        return self._of("samples", survey).frame
 
     def shear(self, survey: str) -> pd.DataFrame:
         """Return xi+ and xi- of the true shapes of a survey's sample (schema: catalogs/shear.yaml).
@@ -195,7 +294,7 @@ class Survey(SurveyProducts):
         Of a region too small for the shortest separation it has no rows. `stages.analysis.shear.significance` is the
         signal to noise of such a table.
         """
-        return self.lensing_products(survey).shear.all_rows()
+        return self._of("shear", survey).all_rows()
 
     def matches(self, linking_length: float | None = None) -> dd.DataFrame:
         """Return the lazy friends-of-friends groups of the samples of all surveys (schema: catalogs/groups.yaml).
@@ -203,7 +302,7 @@ class Survey(SurveyProducts):
         With a linking length (arcsec, no longer than the longest of the pipeline) the column `group` has the groups of
         that length: the stored forest, cut there.
         """
-        products, longest = self.match_products, max(self.pipeline.matches.linking_lengths)
+        products, longest = self.once(matches_of), max(self.pipeline.matches.linking_lengths)
         frame = products.groups.frame
         if linking_length is None:
             return frame
@@ -215,7 +314,33 @@ class Survey(SurveyProducts):
     @property
     def statistics(self) -> SurveyStatistics:
         """Statistics of the groups."""
-        return SurveyStatistics(self.statistic_products, self.pipeline.matches.linking_lengths)
+        return SurveyStatistics(self.once(statistics_of), self.pipeline.matches.linking_lengths)
+
+    @property
+    def differs(self) -> bool:
+        """True where the survey has both bands of the difference images."""
+        return any(one.name.startswith("differences/") for one in stage_products(self))
+
+    def _difference_product(self) -> ImageProduct:
+        settings = self.pipeline.differences
+        for name, instrument in self.instruments.items():
+            if settings.science in instrument.bands:
+                return self.output(f"differences/{name}")
+        raise UserError(f"difference images need {settings.template} of Roman and {settings.science} of Rubin")
+
+    def _of(self, stage: str, survey: str) -> Any:
+        """Return what a stage builds for an instrument."""
+        self._instrument(survey)
+        return self.output(f"{stage}/{survey}")
+
+    def _instrument(self, survey: str) -> Instrument:
+        return self._one(self.instruments, survey, tuple(self.instruments))
+
+    @staticmethod
+    def _one(mapping: Any, name: str, valid: tuple[str, ...]) -> Any:
+        if name not in valid:
+            raise UserError(f"{name!r}: this survey has {', '.join(valid)}")
+        return mapping[name]
 
     def __repr__(self) -> str:
         place = self.store.root if self.store else "not stored"

@@ -94,7 +94,7 @@ def test_every_object_is_in_one_tile_and_in_the_region(survey, name):
     names = {tile.id: tile.name for tile in survey.tiles}
     assert [names[value] for value in owner] == objects["tile"].tolist()
     assert survey.region.contains(objects["coord_ra"], objects["coord_dec"]).all()
-    product = survey.detection_product(name)
+    product = survey.output(f"detections/{name}")
     detections = pd.concat([product.load(k, ("objects",))["objects"] for k in range(len(product.units))])
     assert sorted(detections["objectId"]) == sorted(objects["objectId"])
 
@@ -244,7 +244,7 @@ def test_bright_objects_are_found_and_real(survey, name):
 
 def test_the_map_of_objects_has_the_objects_of_the_table(survey):
     segments = survey.segmentation("roman")["segmentation"].isel(tile=0).values
-    objects = survey.detection_product("roman").load(0, ("objects",))["objects"]
+    objects = survey.output("detections/roman").load(0, ("objects",))["objects"]
     label = objects["objectId"].to_numpy() & 0xFFFFFF
     assert set(label) <= set(np.unique(segments))
     x, y = (np.rint(objects[name]).astype(int) for name in ("x", "y"))
@@ -253,13 +253,13 @@ def test_the_map_of_objects_has_the_objects_of_the_table(survey):
 
 @pytest.mark.parametrize("name", ["roman", "rubin"])
 def test_magnitudes_are_calibrated_on_the_stars_there_are(survey, name):
-    zero = survey.zero_points_product(name).load(0)
+    zero = survey.output(f"zero_points/{name}").load(0)
     assert len(zero) == 3 * len(survey.instruments[name].bands)
     assert (np.abs(zero["offset"]) < 0.5).all()
     first = zero.iloc[0]
     column = f"{first['band']}_{first['flux']}"
     objects = survey.objects(name).compute().set_index("objectId")[column]
-    product = survey.detection_product(name)
+    product = survey.output(f"detections/{name}")
     measured = pd.concat([product.load(k, ("objects",))["objects"] for k in range(len(product.units))])
     measured = measured.set_index("objectId")[column]
     np.testing.assert_allclose(objects, measured.reindex(objects.index) * 10 ** (0.4 * first["offset"]), rtol=1e-5)

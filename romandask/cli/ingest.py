@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from romandask import run as flow
+from romandask import run as running
 from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_place
 from romandask.engine.clients import runner
 from romandask.engine.progress import Reporter
@@ -92,11 +92,11 @@ def _ingest(
         "rubin": {},
     }
     settings = pipeline_of(content, str(source))
-    place = Store(store)
-    survey = Survey(settings)
-    survey.ingested_product  # noqa: B018  opened, so that a wrong source is known before anything is written
-    place.prepare()
+    survey = Survey(settings, Store(store))
+    # opened before anything is written, so that a wrong source is reported first
+    survey.output("truth/ingested")
+    Store(store).prepare()
     reporter = Reporter(Console())
     with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
-        counts = flow.ingest(settings, place, execution, reporter)
+        counts = running.ingest(survey, execution, reporter)
     reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")

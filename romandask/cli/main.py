@@ -19,12 +19,10 @@ from rich.console import Console  # noqa: E402
 from rich.live import Live  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
-from romandask import run as flow  # noqa: E402
-from romandask import stage_graph  # noqa: E402
+from romandask import run as running  # noqa: E402
 from romandask.cli.export import calibration_app, export_app  # noqa: E402
 from romandask.cli.ingest import ingest_app  # noqa: E402
 from romandask.cli.options import Overrides, Scheduler, Source, StoreArgument, StoreOption, Workers, resumable  # noqa: E402
-from romandask.engine import verify as verification  # noqa: E402
 from romandask.engine.clients import runner  # noqa: E402
 from romandask.engine.progress import Reporter, busy, duration  # noqa: E402
 from romandask.export import sha256sums  # noqa: E402
@@ -33,6 +31,7 @@ from romandask.pipeline import load_pipeline  # noqa: E402
 from romandask.report.page import write_report  # noqa: E402
 from romandask.report.reference import reference as data_products  # noqa: E402
 from romandask.report.stage_diagram import dag_svg  # noqa: E402
+from romandask.stage_graph import Selection, stage_products  # noqa: E402
 from romandask.stages.coadds.pixfrac import advice, coverage  # noqa: E402
 from romandask.storage.lock import in_use  # noqa: E402
 from romandask.storage.store import FULL, Store  # noqa: E402
@@ -61,7 +60,7 @@ def plan(
     settings = load_pipeline(pipeline, overrides)
     with busy("planning"):
         survey = Survey(settings)
-        rows = stage_graph.plan(survey)
+        rows = running.plan(survey)
     table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
     for row in rows:
         size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
@@ -86,7 +85,7 @@ def plan(
 def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
     """Show what each pixfrac does to the coadds of Roman's dithers, and recommend one; make nothing."""
     with busy("drizzling weights"):
-        found = coverage(Survey(load_pipeline(pipeline, overrides)).coadd_product("roman"))
+        found = coverage(Survey(load_pipeline(pipeline, overrides)).output("coadds/roman"))
     table = Table("band", "exposures", "pixfrac", "empty pixels", "rms / median of weight", "")
     for one in found:
         cells = (str(one.exposures), f"{one.pixfrac:.1f}", f"{one.empty:.2%}", f"{one.uneven:.3f}")
@@ -117,25 +116,25 @@ def run(
     ] = False,
 ) -> None:
     """Make and store everything that is missing, then the report. The same command resumes."""
-    settings = load_pipeline(pipeline, overrides)
-    reporter = Reporter(Console())
+    survey = Survey(load_pipeline(pipeline, overrides), Store(store))
+    settings, reporter = survey.pipeline, Reporter(Console())
+    selection = Selection(tuple(only or ()), start)
     with reporter.busy("planning"):
-        planned = stage_graph.plan(Survey(settings))
-    place, chosen = Store(store), stage_graph.Chosen(tuple(only or ()), start)
+        planned = running.plan(survey)
+        selection.of(stage_products(survey))
     if dry_run or explain:
         with reporter.busy("finding what there is to do"):
-            _explain(Survey(settings, place), chosen, retry, reporter)
+            _explain(survey, selection, retry, reporter)
     if dry_run:
         return
-    chosen.of(stage_graph.stages(Survey(settings)))
     began = time.monotonic()
     count = settings.run.workers if workers is None else workers
     with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
-        place.prepare()
+        Store(store).prepare()
         hours = sum(row.hours for row in planned)
         reporter.say(f"{settings.name}: {execution.description}")
         reporter.say(f"{sum(row.units for row in planned)} units, {duration(hours * 3600)} of a core by the plan")
-        summary = flow.run(settings, place, execution, reporter, chosen, retry)
+        summary = running.run(survey, execution, reporter, selection, retry)
     made, kept = sum(summary.made.values()), sum(summary.kept.values())
     if made == 0 and not summary.failed:
         reporter.say(f"nothing to do: all {kept} units of {store} are done")
@@ -148,7 +147,7 @@ def run(
     if summary.failed:
         reporter.say(f"the reasons are in {store}/manifest/<stage>/<unit>.failed; --retry-failed makes them again")
         raise typer.Exit(1)
-    page = place.report / "index.html"
+    page = Store(store).report / "index.html"
     if only or start:
         return
     if made or not page.exists():
@@ -157,8 +156,8 @@ def run(
         reporter.say(f"report: {path}")
 
 
-def _explain(survey: Survey, chosen: stage_graph.Chosen, retry: bool, reporter: Reporter) -> None:
-    for row in flow.explain(survey, chosen, retry):
+def _explain(survey: Survey, selection: Selection, retry: bool, reporter: Reporter) -> None:
+    for row in running.explain(survey, selection, retry):
         if row.made or row.reasons:
             reasons = ", ".join(f"{count} {why}" for why, count in row.reasons.items())
             reporter.say(f"{row.stage:22s} make {row.made}, keep {row.kept}: {reasons}")
@@ -185,11 +184,12 @@ def status(
 
 def _status(survey: Survey) -> Table:
     table = Table(
-        "stage", "units", "done", "missing", "failed", caption=flow.last_event(survey), caption_justify="left"
+        "stage", "units", "done", "missing", "failed", caption=running.last_event(survey), caption_justify="left"
     )
-    for name, units, done, failed in flow.status(survey):
-        known = units >= 0
-        table.add_row(name, str(units) if known else "?", str(done), str(units - done) if known else "?", str(failed))
+    for row in running.status(survey):
+        units = "?" if row.units is None else str(row.units)
+        missing = "?" if row.units is None else str(row.units - row.done)
+        table.add_row(row.stage, units, str(row.done), missing, str(row.failed))
     return table
 
 
@@ -211,12 +211,12 @@ def verify(
     units = damaged = 0
     with busy("reading every byte"):
         survey = open_survey(store)
-        for found in verification.verify(survey, only):
+        for found in running.verify_store(survey, only):
             units, damaged = units + found.units, damaged + len(found.damaged)
             for name, why in found.damaged:
                 print(f"damaged: {found.stage}/{name}: {why}")
             if forget and found.damaged:
-                verification.forget(survey, found)
+                running.forget_damaged(survey, found)
     if damaged:
         print(
             f"{damaged} damaged: " + ("run again, they are made anew" if forget else "verify --forget, then run again")

@@ -1,4 +1,4 @@
-"""What there is to do of a stage: units that are not there, or not as they would be made now; and those that failed."""
+"""Staleness: the units of a stage that are missing or outdated, and those that failed before."""
 
 from __future__ import annotations
 
@@ -19,76 +19,85 @@ FAILED = ".failed"
 """Ending of the files that say why a unit failed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Staleness:
-    """The units of a stage by what is to be done with them."""
+    """The units of a stage by what a run does with them."""
 
     tasks: list[Task]
+    """Stale units, missing or outdated, that can be made."""
     kept: int
-    """Units that are there as they should be."""
+    """Number of units that are up to date."""
     blocked: list[str]
-    """Units of which an input is missing."""
-    aside: list[str]
-    """Units that failed, with inputs that have not changed since."""
+    """Units that cannot be made because an input is missing."""
+    failed: list[str]
+    """Units that failed before and whose inputs have not changed since: they are skipped."""
+    outdated: list[str]
+    """Units that have a record which no longer holds."""
 
 
 def find_stale(
     product: ImageProduct | TableProduct,
     store: Store,
-    coming: Set[tuple[str, str]] | None = None,
+    coming: Set[tuple[str, str]] = frozenset(),
     retry: bool = False,
 ) -> Staleness:
-    """Return what is to be done; the records of units that are to be made, or cannot be, are removed, but in a plan.
+    """Return the units of a stage by what a run would do with them. Nothing is changed.
 
     Parameters
     ----------
-    coming : in a plan, units of earlier stages that will be made; None in a run
-    retry : make what failed, too
+    coming : set of (stage, unit)
+        Units of earlier stages that will be made first, where a run is only explained.
+    retry : bool
+        Make again what failed before.
     """
-    forget, coming = coming is None, coming or set()
-    stored: dict[str, dict[str, str]] = {}
+    outputs: dict[str, dict[str, str]] = {}
 
     def output(source: tuple[str, str]) -> str | None:
         if source in coming:
             return "to be made"
         stage, name = source
-        if stage not in stored:
-            stored[stage] = {unit: record.output for unit, record in read_records(store, stage) if record}
-        return stored[stage].get(name)
+        if stage not in outputs:
+            outputs[stage] = {unit: record.output for unit, record in read_records(store, stage) if record}
+        return outputs[stage].get(name)
 
     records, failed_with = dict(read_records(store, product.stage)), failures(store, product.stage)
     tasks: dict[str, Task] = {}
+    prerequisites: dict[str, tuple[str, ...]] = {}
     blocked: list[str] = []
-    aside: list[str] = []
-    waiting: dict[str, tuple[str, ...]] = {}
+    skipped: list[str] = []
+    outdated: list[str] = []
     kept = 0
     for index, unit in enumerate(product.units):
         if any(output(source) is None for source in unit.inputs):
             blocked.append(unit.name)
-            if forget and unit.name in records:
-                remove(store.record(product.stage, unit.name))
+            outdated += [unit.name] if unit.name in records else []
             continue
         parts = _parts(unit, output)
         inputs, record = digest(product.stage, parts), records.get(unit.name)
         if record is not None and record.inputs == inputs:
             kept += 1
             continue
-        again = failed_with.get(unit.name) == inputs
-        if again and not retry:
-            aside.append(unit.name)
+        failed_before = failed_with.get(unit.name) == inputs
+        if failed_before and not retry:
+            skipped.append(unit.name)
             continue
-        why = FAILED_BEFORE if again else _why(unit.name, records, parts)
-        if forget and unit.name in records:
-            remove(store.record(product.stage, unit.name))
+        why = FAILED_BEFORE if failed_before else _why(unit.name, records, parts)
+        outdated += [unit.name] if unit.name in records else []
         tasks[unit.name] = Task(index, inputs, unit.cost, unit.affinity, parts=parts, why=why)
-        waiting[unit.name] = unit.prerequisites
-    held = _held(waiting, {*blocked, *aside})
-    chosen = [
-        replace(task, prerequisites=tuple(tasks[other].index for other in waiting[name] if other in tasks))
+        prerequisites[unit.name] = unit.prerequisites
+    held = _held(prerequisites, {*blocked, *skipped})
+    ready = [
+        replace(task, prerequisites=tuple(tasks[other].index for other in prerequisites[name] if other in tasks))
         for name, task in tasks.items()
         if name not in held
     ]
-    return Staleness(chosen, kept, blocked + sorted(held), aside)
+    return Staleness(tasks=ready, kept=kept, blocked=blocked + sorted(held), failed=skipped, outdated=outdated)
+
+
+def remove_outdated_records(product: ImageProduct | TableProduct, store: Store, found: Staleness) -> None:
+    """Remove the records of units that are to be made again, or cannot be."""
+    for name in found.outdated:
+        remove(store.record(product.stage, name))
 
 
 def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
@@ -114,10 +123,12 @@ def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) ->
     return f"changed: {', '.join(changed)}"
 
 
-def _held(waiting: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
-    """Return the units that cannot be made because one that they come after cannot."""
+def _held(prerequisites: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
+    """Return the units of which a prerequisite, or a prerequisite of that, cannot be made."""
     held: set[str] = set()
-    while found := {name for name, after in waiting.items() if name not in held and set(after) & (missing | held)}:
+    while found := {
+        name for name, before in prerequisites.items() if name not in held and set(before) & (missing | held)
+    }:
         held |= found
     return held
 

@@ -1,18 +1,17 @@
-"""Verification: every stored byte against what the manifest says was written."""
+"""Verify a store: every stored byte against what the manifest says was written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from romandask.engine.run_stages import RunnableStage
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
-from romandask.stage_graph import stages
 from romandask.storage.checksums import damaged_files, remove_checksums
 from romandask.storage.manifest import Record, read_records
 from romandask.storage.paths import remove, remove_folder
 from romandask.storage.store import Store
-from romandask.survey import Survey
 
 BESIDE = ("truth/seds", "store")
 """What is stored beside the units of stages: the library of spectra, and settings and versions."""
@@ -29,55 +28,52 @@ class Verified:
     """Units, and files beside them, that are not as they were written, each with what was found."""
 
 
-def verify(survey: Survey, only: str | None = None) -> Iterator[Verified]:
-    """Yield, a stage at a time, what is stored and what of it is not as it was written. Nothing is changed.
+def verify(stages: list[RunnableStage], store: Store, only: str | None = None) -> Iterator[Verified]:
+    """Yield, stage by stage, how many units are stored and which are not as they were written. Nothing is changed.
 
     Parameters
     ----------
-    only : a stage; None for all
+    only : str or None
+        Name of one stage's product, or of one of `BESIDE`; None for all.
     """
-    store = survey.store
-    assert store is not None
-    for stage in stages(survey):
+    for stage in stages:
         if only is not None and stage.name != only:
             continue
         records = dict(read_records(store, stage.name))
         if not records:
             continue
-        product, found = stage.product(survey), []
+        product, damaged = stage.product(), []
         numbers = {name: index for index, name in enumerate(product.names)}
         for name, record in records.items():
             why = _damage(product, store, numbers, name, record)
             if why is not None:
-                found.append((name, why))
-        yield Verified(stage.name, len(records), tuple(found + damaged_files(store, stage.name)))
+                damaged.append((name, why))
+        yield Verified(stage.name, len(records), tuple(damaged + damaged_files(store, stage.name)))
     for name in BESIDE:
         if only in (None, name):
             yield Verified(name, 0, tuple(damaged_files(store, name)))
 
 
-def forget(survey: Survey, found: Verified) -> None:
-    """Remove the records of what is damaged in a stage, so that the next run makes it anew.
+def forget(store: Store, verified: Verified) -> None:
+    """Remove the records of the damaged units of a stage, so that the next run makes them again.
 
-    Where files beside an image product's units are damaged, what the arrays are cannot be told for sure any more: all
-    its units are forgotten.
+    Where metadata beside the units of an image product is damaged, the content of its arrays is no longer certain: the
+    records of all its units are removed.
     """
-    store = survey.store
-    assert store is not None
-    beside = {name for name, _ in damaged_files(store, found.stage)}
-    for name, _ in found.damaged:
+    beside = {name for name, _ in damaged_files(store, verified.stage)}
+    for name, _ in verified.damaged:
         if name not in beside:
-            remove(store.record(found.stage, name))
+            remove(store.record(verified.stage, name))
     if not beside:
         return
-    remove_checksums(store, found.stage)
+    remove_checksums(store, verified.stage)
     for name in beside:
         remove(store.root / name)
-    if store.images(found.stage).exists():
-        remove_folder(store.images(found.stage))
-        for name in store.recorded(found.stage):
-            remove(store.record(found.stage, name))
-    remove(store.catalog(found.stage) / "hats.properties")
+    if store.images(verified.stage).exists():
+        remove_folder(store.images(verified.stage))
+        for name in store.recorded(verified.stage):
+            remove(store.record(verified.stage, name))
+    remove(store.catalog(verified.stage) / "hats.properties")
 
 
 def _damage(

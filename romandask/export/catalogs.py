@@ -69,7 +69,7 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
     UserError
         If the survey has no such exposure, or the folder cannot be written.
     """
-    product = survey.psf_product("roman")
+    product = survey.output("psfs/roman")
     indices = indices_of(product, names, "exposure", "this survey")
     prepare(folder)
     attributes = product.variables[0].attributes
@@ -118,7 +118,7 @@ def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size
     layers = ("image", "background", "weight", "dq", "psf")
     every = {band: survey.cutouts(objects, layers, (band,), size) for band in bands}
     prepare(folder)
-    names = survey.exposure_product("roman").names
+    names = survey.output("exposures/roman").names
     exptimes = dict(zip(names, survey.pointings("roman")["exptime"], strict=True))
     written = []
     for band, found in every.items():

@@ -46,10 +46,10 @@ def export_fits(
     """
     chosen = []
     if exposures:
-        product = survey.exposure_product(name)
+        product = survey.output(f"exposures/{name}")
         chosen += [(product, index, f"exposure-{name}") for index in units_named(product, exposures, "exposure")]
     if tiles:
-        product = survey.coadd_product(name)
+        product = survey.output(f"coadds/{name}")
         chosen += [(product, index, f"coadd-{name}") for index in tile_units(survey, name, tiles, bands)]
     prepare(folder)
     written = []
@@ -68,7 +68,7 @@ def tile_units(survey: Survey, name: str, tiles: Sequence[str], bands: Sequence[
     if wrong:
         raise UserError(f"band {wrong[0]!r}: {name} has {', '.join(known)}")
     units = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-    return units_named(survey.coadd_product(name), units, "tile")
+    return units_named(survey.output(f"coadds/{name}"), units, "tile")
 
 
 def units_named(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:
@@ -185,9 +185,9 @@ def export_obscore(survey: Survey, path: Path) -> int:
 
 def _images(survey: Survey, name: str) -> list[ImageProduct]:
     """Return the image products of one survey that are stored."""
-    found = [survey.coadd_product(name)]
+    found = [survey.output(f"coadds/{name}")]
     if survey.instruments[name].coadd != "draw":
-        found.insert(0, survey.exposure_product(name))
+        found.insert(0, survey.output(f"exposures/{name}"))
     return found
 
 

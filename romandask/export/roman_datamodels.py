@@ -27,7 +27,7 @@ def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[
         If the survey has no such exposure, it is not stored, or the package roman_datamodels is not there.
     """
     roman_asdf.available()
-    product = survey.exposure_product("roman")
+    product = survey.output("exposures/roman")
     chosen = units_named(product, exposures, "exposure")
     flags = flags_of(product)
     prepare(folder)
@@ -66,7 +66,7 @@ def export_mosaics(survey: Survey, folder: Path, tiles: Sequence[str], bands: Se
         If the survey has no such tile or band, it is not stored, or the package roman_datamodels is not there.
     """
     roman_asdf.available()
-    product = survey.coadd_product("roman")
+    product = survey.output("coadds/roman")
     chosen = tile_units(survey, "roman", tiles, bands)
     prepare(folder)
     written = []

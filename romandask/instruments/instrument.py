@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal, Protocol
 
@@ -15,6 +16,7 @@ from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
+from romandask.products.images import ImageProduct
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,13 @@ class Instrument(Protocol):
     @property
     def coadd(self) -> Literal["drizzle", "warp", "draw"]:
         """How tiles are made: drizzled or warped from exposures, or drawn directly from the cadence."""
+
+    @property
+    def calibrated(self) -> bool:
+        """True where exposures are made with the calibrations of their detectors."""
+
+    def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
+        """Return the lazy calibrations of some detectors; None where the instrument has none."""
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass, with the wavelengths at which the PSF is known."""

@@ -28,6 +28,7 @@ from romandask.storage.arrays import (
     write_coordinate,
     write_group,
 )
+from romandask.storage.checksums import image_metadata_files
 from romandask.storage.manifest import digest, read_record
 from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store, read_parquet, write_parquet
@@ -72,6 +73,11 @@ class ImageProduct:
     def names(self) -> tuple[str, ...]:
         """Names of the units."""
         return names_of(self.units)
+
+    @property
+    def product(self) -> ImageProduct:
+        """The product itself: a stage may build it bare, or in a value that says more of it."""
+        return self
 
     def stored(self, store: Store) -> ImageProduct:
         """Return the same product, reading what the store has."""
@@ -122,6 +128,16 @@ class ImageProduct:
             found = str(error).splitlines()[0] if str(error) else type(error).__name__
             what = f"{self.stage} {self.names[unit]}: {name} is damaged ({found})"
             raise UserError(f"{what}: romandask verify --forget, then run again") from error
+
+    @property
+    def stored_bytes(self) -> int:
+        """Uncompressed bytes of the images of all units."""
+        one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in self.variables)
+        return one * len(self.units)
+
+    def metadata_files(self, store: Store) -> list[AnyPath]:
+        """Return the stored files that belong to no unit: metadata of the arrays, and coordinates."""
+        return image_metadata_files(store, self.stage, [variable.name for variable in self.variables])
 
     def prepare(self, store: Store) -> None:
         """Make the arrays and coordinates that units are written into."""

@@ -43,6 +43,11 @@ class TableProduct:
         """Names of the units."""
         return names_of(self.units)
 
+    @property
+    def product(self) -> TableProduct:
+        """The product itself: a stage may build it bare, or in a value that says more of it."""
+        return self
+
     def stored(self, store: Store) -> TableProduct:
         """Return the same product, reading what the store has."""
         return replace(self, store=store)
@@ -117,6 +122,15 @@ class TableProduct:
     def empty(self) -> pd.DataFrame:
         """Return no rows, with the right columns."""
         return to_frame(self.schema.empty_table())
+
+    @property
+    def stored_bytes(self) -> int:
+        """Zero: how many rows there are depends on what is found."""
+        return 0
+
+    def metadata_files(self, store: Store) -> list[AnyPath]:
+        """Return no files: those of a HATS catalog are written when all its units are there."""
+        return []
 
     def prepare(self, store: Store) -> None:
         """Tables need nothing before their units are written."""

@@ -24,8 +24,8 @@ def blends(survey: Survey) -> str:
     if not _joint(survey):
         return ""
     lengths, statistics = survey.pipeline.matches.linking_lengths, survey.statistics
-    rows = {name: len(survey.sample_product(name).column("objectId")) for name in survey.instruments}
-    limits = [survey.limit_product(name).load(0).iloc[0] for name in survey.instruments]
+    rows = {name: len(survey.output(f"samples/{name}").column("objectId")) for name in survey.instruments}
+    limits = [survey.output(f"limits/{name}").load(0).iloc[0] for name in survey.instruments]
     cuts = ", ".join(f"{row['band']} < {row['limit']:.2f}" for row in limits if np.isfinite(row["limit"]))
     kind = "unflagged, with a true counterpart" if survey.pipeline.matches.sample == "clean" else "all objects"
     text = (
@@ -68,7 +68,7 @@ def _blend_row(survey: Survey, length: float, table: pd.DataFrame, chance: pd.Da
     objects, blends = int(total["rubin_objects"]), int(total["blends"])
     counts = survey.statistics.blends(length)
     alone = int(counts.loc[0].drop(0, errors="ignore").sum()) if 0 in counts.index else 0
-    faintest = float(survey.limit_product("rubin").load(0)["limit"].iloc[0])
+    faintest = float(survey.output("limits/rubin").load(0)["limit"].iloc[0])
     near = table.loc[table["i_mag_high"] > faintest - 1, "alone"].sum()
 
     def share(part: float, whole: float) -> str:
@@ -95,7 +95,7 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     here = groups[[row.objectId in ids[row.survey] for row in groups.itertuples()]]
     if not len(here):
         return ""
-    tiles = {key: survey.coadd_product(key) for key in survey.instruments}
+    tiles = {key: survey.output(f"coadds/{key}") for key in survey.instruments}
     makers = {key: tile_maker(product) for key, product in tiles.items()}
     frames, images = {key: maker.wcs(tile) for key, maker in makers.items()}, {}
     x, y = frames["rubin"].all_world2pix(here["coord_ra"], here["coord_dec"], 0)
@@ -135,7 +135,7 @@ def _joint(survey: Survey) -> bool:
 
 def _with_blends(survey: Survey) -> pd.DataFrame:
     """Return the objects of all groups with `blend`: True in an unrecognised one, at the first linking length."""
-    groups = survey.match_products.groups.all_rows()
+    groups = survey.output("matches/groups").all_rows()
     number = groups[f"group_{length_name(survey.pipeline.matches.linking_lengths[0])}"]
     rubin = (groups["survey"] == "rubin").groupby(number).transform("sum")
     roman = (groups["survey"] == "roman").groupby(number).transform("sum")
@@ -153,14 +153,14 @@ def difference_images(survey: Survey) -> str:
     """Return the differences of Rubin's tiles and Roman's: a picture of one, and what is left of all objects."""
     if not survey.differs:
         return ""
-    product, settings = survey.difference_product, survey.pipeline.differences
+    product, settings = survey.output("differences/rubin"), survey.pipeline.differences
     tables = [product.load(k, ("residuals",))["residuals"] for k in range(len(product.units))]
     table = pd.concat(tables)
     if not len(table):
         return ""
     tile = int(np.argmax([len(one) for one in tables]))
     arrays = product.load(tile)
-    science = survey.coadd_product("rubin").load(
+    science = survey.output("coadds/rubin").load(
         tile * len(survey.bands("rubin")) + survey.bands("rubin").index(settings.science), ("image",)
     )["image"]
     count = int(SHOWN / survey.instruments["rubin"].coadd_scale)

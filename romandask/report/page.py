@@ -50,7 +50,7 @@ th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align
 def write_report(survey: Survey) -> AnyPath:
     """Write the page of a stored survey and return where it is."""
     assert survey.store is not None
-    objects = {name: survey.object_product(name).all_rows() for name in survey.instruments}
+    objects = {name: survey.output(f"objects/{name}").all_rows() for name in survey.instruments}
     busiest = _busiest_tile(survey, objects)
     sections = [
         _overview(survey, objects),
@@ -97,7 +97,7 @@ def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
 def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     pairs, layers = {}, {}
     for name, instrument in survey.instruments.items():
-        product = survey.coadd_product(name)
+        product = survey.output(f"coadds/{name}")
         bands = {}
         for position, band in enumerate(instrument.bands):
             arrays = product.load(unit_of(tile, band, instrument.bands), ("image", "weight", "nimages"))
@@ -121,7 +121,7 @@ def _detector(survey: Survey) -> str:
     """Return what each effect of the detectors does, where they are modelled in full."""
     if survey.pipeline.calibration() is None:
         return ""
-    product, table = survey.exposure_product("roman"), survey.pointings("roman")
+    product, table = survey.output("exposures/roman"), survey.pointings("roman")
     # one that has an afterglow, if there is one
     index = next((row for row in range(len(table)) if len(before(table, row))), 0)
     name = product.names[index]
@@ -156,9 +156,9 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
     true, measured, middle, colours = {}, {}, {}, {}
     depth = {band: value for name in objects for band, value in depths(objects[name], survey.bands(name)).items()}
-    matched = {name: survey.truth_match_product(name).all_rows() for name in objects}
+    matched = {name: survey.output(f"truth_match/{name}").all_rows() for name in objects}
     joined = {
-        name: with_truth(frame, matched[name], survey.truth_summary_product(name).all_rows())
+        name: with_truth(frame, matched[name], survey.output(f"truth_summary/{name}").all_rows())
         for name, frame in objects.items()
     }
     for name, frame in objects.items():

@@ -8,7 +8,7 @@ from romandask.model.resources import resource_folder
 from romandask.model.settings import read_yaml
 from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct
-from romandask.stage_graph import stages
+from romandask.stage_graph import stage_products
 from romandask.survey import Survey
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -45,13 +45,13 @@ def _images() -> list[str]:
     found: dict[str, str] = {}
     for text, overrides in VARIANTS.items():
         survey = Survey(load_pipeline("tiny", list(overrides)))
-        for stage in stages(survey):
-            product = stage.product(survey)
+        for one in stage_products(survey):
+            product = survey.product(one.name)
             if isinstance(product, ImageProduct):
                 section = _image(product)
                 if section not in found:
                     found[section] = f"## {product.stage}{f' ({text})' if text else ''}\n\n{section}"
-        psfs = {f"psfs/{name}": survey.psf_product(name) for name in survey.instruments} if not overrides else {}
+        psfs = {f"psfs/{name}": survey.output(f"psfs/{name}") for name in survey.instruments} if not overrides else {}
         for name, product in psfs.items():
             found.setdefault(_image(product), f"## {name} (made on demand, not stored)\n\n{_image(product)}")
     return sorted(found.values())

@@ -138,7 +138,7 @@ def write_sky_viewer(survey: Survey, folder: Path) -> Path:
         If no coadds are stored, or the region is too wide for one plane.
     """
     plane = _plane(survey)
-    layers = {name: Layer(survey.coadd_product(name), plane) for name in survey.instruments}
+    layers = {name: Layer(survey.output(f"coadds/{name}"), plane) for name in survey.instruments}
     layers = {name: layer for name, layer in layers.items() if layer.numbers}
     if not layers:
         raise UserError("no coadds are stored: romandask run makes them")

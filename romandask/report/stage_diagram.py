@@ -8,22 +8,27 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from romandask.stage_graph import Planned, reads, stages, tier
+from romandask.run import PlannedStage
+from romandask.stage_graph import StageProduct, stage_products
 from romandask.survey import Survey
 
 
-def dag_svg(survey: Survey, rows: list[Planned], path: Path) -> None:
-    """Write the stages of a survey as an SVG picture: a box a kind with its units, an arrow from what it is made from.
+def dag_svg(survey: Survey, rows: list[PlannedStage], path: Path) -> None:
+    """Write the stages of a survey as an SVG picture: a box a kind with its units, arrows from what it is made from.
 
     Parameters
     ----------
-    rows : the survey's plan
+    survey : Survey
+    rows : list of PlannedStage
+        The survey's plan.
+    path : Path
+        The SVG file.
     """
     lines: dict[str, list[str]] = {}
     for row in rows:
         kind, part = row.stage.split("/")
         lines.setdefault(kind, [kind]).append(f"{part}: {row.units}")
-    arrows = _reduced(kinds_read(survey))
+    arrows = _reduced(kinds_read(stage_products(survey)))
     columns: dict[int, list[str]] = {}
     for kind in lines:
         columns.setdefault(_column(kind, arrows), []).append(kind)
@@ -38,24 +43,18 @@ def dag_svg(survey: Survey, rows: list[Planned], path: Path) -> None:
     reach = max(map(len, columns.values())) / 2
     axes.set_ylim(-reach, reach)
     axes.set_axis_off()
-    # text stays text, to be found and read aloud
+    # text stays text, so that it can be searched and read aloud
     with rc_context({"svg.fonttype": "none"}):
         figure.savefig(path, format="svg")
 
 
-def kinds_read(survey: Survey) -> dict[str, set[str]]:
-    """Return, by kind of stage, the kinds that it is made from."""
-    found: dict[str, set[str]] = {}
-    for stage in stages(survey):
-        kind, part = stage.name.split("/")
-        sources = reads(stage.product(survey))
-        # the units of what is made from truth alone, and the SCAs of which there are calibrations, are in the pointings
-        drawn = sources and all(source.startswith(("truth/", "calibration/")) for source in sources)
-        if kind == "calibration" or (drawn and tier(stage.name) == 2):
-            sources |= {f"pointings/{part}"}
-        found.setdefault(kind, set()).update(source.split("/")[0] for source in sources)
-        found[kind].discard(kind)
-    return found
+def kinds_read(products: list[StageProduct]) -> dict[str, set[str]]:
+    """Return, by kind of stage, the kinds that it is made from, or whose content decides which units it has."""
+    arrows: dict[str, set[str]] = {}
+    for one in products:
+        sources = {name.split("/")[0] for name in one.reads | one.known_after}
+        arrows.setdefault(one.kind, set()).update(sources - {one.kind})
+    return arrows
 
 
 def _reduced(arrows: dict[str, set[str]]) -> dict[str, set[str]]:

@@ -34,7 +34,8 @@ from romandask.products.schemas import schema
 from romandask.products.tables import to_frame
 from romandask.products.units import LazyUnits, Unit
 from romandask.stages.pointings import corners_of
-from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
+from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
 from romandask.storage.arrays import Variable
 from romandask.storage.manifest import read_record
 from romandask.storage.store import Store, read_parquet
@@ -341,3 +342,38 @@ def header_text(header: dict) -> str:
 def wcs_of(text: str) -> WCS:
     """Return the WCS of a header text."""
     return WCS(fits.Header.fromstring(text))
+
+
+def build_exposures(context: SurveyContext, survey: str) -> ImageProduct:
+    """Return the lazy exposures of an instrument."""
+    pipeline, instrument = context.pipeline, context.instruments[survey]
+    calibration = context.output(f"calibration/{survey}") if instrument.calibrated else None
+    return exposures(
+        context.pointings(survey),
+        context.once(truth_of),
+        instrument,
+        pipeline.render,
+        pipeline.seed,
+        calibration,
+        context.store,
+    )
+
+
+def has_exposures(context: SurveyContext, survey: str) -> bool:
+    """Return whether an instrument's coadds are made from exposures, not drawn from its cadence."""
+    return context.instruments[survey].coadd != "draw"
+
+
+EXPOSURES = Stage(
+    name="exposures",
+    per_survey=True,
+    build=build_exposures,
+    exists=has_exposures,
+    reads=("truth/galaxies", "truth/stars", "calibration"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="visit and detector",
+    summary="Images rendered in Fourier space with the chromatic PSF of each place on the detector: the noiseless "
+    "image of the objects beside the observed one; a simple detector, or every effect of the SCAs or CCDs.",
+    shrink_with="lower render.largest",
+    tables={"trapped": "exposures/<survey>_trapped/"},
+)

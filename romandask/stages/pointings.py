@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +14,11 @@ from romandask.instruments.instrument import EXPOSURE_COLUMNS, Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile
-from romandask.storage.paths import AnyPath, access_errors_explained, resolve_below
+from romandask.products.schemas import schema
+from romandask.products.tables import TableProduct
+from romandask.products.units import Unit
+from romandask.stages.stage import Stage, SurveyContext
+from romandask.storage.paths import AnyPath, access_errors_explained, file_state, resolve_below
 
 READERS: dict[str, Callable[[AnyPath], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
@@ -94,3 +100,70 @@ def _exposures(instrument: Instrument, visits: pd.DataFrame, tiles: np.ndarray) 
     rows = rows[list(EXPOSURE_COLUMNS)].reset_index(drop=True)
     outline = pd.DataFrame(footprints[touching].reshape(-1, 8), columns=list(CORNERS))
     return pd.concat([rows, outline], axis=1).sort_values(["visit", "detector"], ignore_index=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MakePointings:
+    """Makes the pointings table of one instrument."""
+
+    instrument: Instrument
+    settings: Any
+    """The `pointings` section of its block in the pipeline."""
+    data: AnyPath
+    region: Region
+    tiles: tuple[Tile, ...]
+    side: float
+    """Of the padded tiles, arcsec."""
+    seed: int
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        """Return the rows of the one unit."""
+        return pointings(self.instrument, self.settings, self.data, self.region, list(self.tiles), self.side, self.seed)
+
+
+def build_pointings(context: SurveyContext, survey: str) -> TableProduct:
+    """Return the lazy pointings of an instrument: one unit."""
+    pipeline = context.pipeline
+    block = pipeline.block(survey)
+    settings = {
+        "settings": block.model_dump(),
+        "region": pipeline.region.model_dump(),
+        "seed": pipeline.seed,
+        "coadds": pipeline.coadds.model_dump(exclude={"pixfrac"}),
+        "source": _source_state(context.data, block.pointings.path),
+    }
+    maker = MakePointings(
+        instrument=context.instruments[survey],
+        settings=block.pointings,
+        data=context.data,
+        region=context.region,
+        tiles=tuple(context.tiles),
+        side=pipeline.coadds.grid().side,
+        seed=pipeline.seed,
+    )
+    return TableProduct(
+        stage=f"pointings/{survey}",
+        units=(Unit("all", settings),),
+        make=maker,
+        schema=schema("pointings"),
+        bytes_per_unit=1 << 30,
+    )
+
+
+def _source_state(data: AnyPath, path: str | None) -> Any:
+    """Return what identifies the content of a source file without reading it."""
+    if path is None:
+        return None
+    file = resolve_below(data, path)
+    return (path, *file_state(file)) if file.is_file() else (path,)
+
+
+POINTINGS = Stage(
+    name="pointings",
+    per_survey=True,
+    build=build_pointings,
+    unit="instrument",
+    summary="Exposures (visit and detector) that touch the tiles: a generated plan or cadence, an observing sequence "
+    "(FITS) or an OpSim database.",
+    tables={"pointings": "pointings/<survey>.parquet"},
+)

@@ -12,6 +12,7 @@ from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.images import ImageProduct
 from romandask.products.units import LazyUnits, Unit
 from romandask.stages.exposures import RenderExposure
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 from romandask.storage.arrays import Variable
 
 OVERSAMPLING = 8
@@ -89,3 +90,14 @@ def flat_shares(bandpass: Bandpass) -> np.ndarray:
     """Return the share of the photons of a source of flat f_nu that goes to each PSF node of a band."""
     photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
     return photons / photons.sum()
+
+
+PSF_IMAGES = Stage(
+    name="psfs",
+    per_survey=True,
+    build=lambda context, survey: psfs(context.output(f"exposures/{survey}")),
+    units_known_after=UNITS_FROM_POINTINGS,
+    on_demand=True,
+    unit="visit and detector",
+    summary="A unit star at the middle of the detector, sampled eight times finer than its pixels.",
+)

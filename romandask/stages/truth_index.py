@@ -12,7 +12,8 @@ from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import LazyUnits, Unit
-from romandask.stages.exposures import RenderExposure, View
+from romandask.stages.exposures import RenderExposure, View, has_exposures
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 
 def truth_index(exposures: ImageProduct) -> TableProduct:
@@ -85,3 +86,17 @@ def index_of(view: View, zero: float) -> pd.DataFrame:
         }
     )
     return frame[reasons != OFF_IMAGE].reset_index(drop=True)
+
+
+TRUTH_INDEX = Stage(
+    name="truth_index",
+    per_survey=True,
+    build=lambda context, survey: truth_index(context.output(f"exposures/{survey}")),
+    exists=has_exposures,
+    reads=("truth/galaxies", "truth/stars", "calibration"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="visit and detector",
+    summary="Every object with light on the exposure: position, flux, magnitude, or why it is not drawn.",
+    shrink_with="lower render.largest",
+    tables={"truth_index": "truth_index/<survey>/"},
+)

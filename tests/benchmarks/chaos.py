@@ -26,13 +26,13 @@ from conftest import MINI
 from output_hashes import output_hashes
 
 from romandask.engine.event_log import events, runs
-from romandask.engine.verify import verify
 from romandask.export import sha256sums
 from romandask.export.catalogs import export_meds, export_psf, export_truth
 from romandask.export.images import export_fits, export_moc
 from romandask.export.roman_datamodels import export_asdf, export_mosaics
 from romandask.model.seeds import rng
 from romandask.model.sky import Cone
+from romandask.run import verify_store
 from romandask.survey import open_survey
 
 WORKERS = 2
@@ -167,7 +167,7 @@ def damage(store: Path, count: int, random: np.random.Generator) -> None:
 
     def found(path: Path) -> bool:
         try:
-            return any(one.damaged for one in verify(open_survey(store), None))
+            return any(one.damaged for one in verify_store(open_survey(store)))
         except Exception:
             # at reading
             return True
@@ -178,7 +178,7 @@ def damage(store: Path, count: int, random: np.random.Generator) -> None:
 def damage_exports(store: Path, folder: Path, count: int, random: np.random.Generator) -> None:
     """The same of exported files, an exposure and a tile in every format."""
     survey = open_survey(store)
-    roman, tile = survey.exposure_product("roman").names[0], survey.tiles[0]
+    roman, tile = survey.output("exposures/roman").names[0], survey.tiles[0]
     written = export_fits(survey, folder, "roman", [roman], [tile.name], [])
     written += export_asdf(survey, folder, [roman]) + export_mosaics(survey, folder, [tile.name], [])
     written += export_truth(survey, folder) + export_psf(survey, folder, [roman]) + export_moc(survey, folder)

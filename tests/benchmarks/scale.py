@@ -18,7 +18,7 @@ from pathlib import Path
 import cloudpickle
 from rich.console import Console
 
-from romandask import run as flow
+from romandask import run as running
 from romandask.engine import run_stages
 from romandask.engine.clients import Runner, runner
 from romandask.engine.progress import Reporter
@@ -27,7 +27,7 @@ from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.products.units import Made
-from romandask.stage_graph import plan
+from romandask.stages.truth import catalogs
 from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store
 from romandask.survey import Survey
@@ -75,16 +75,16 @@ class Idle:
 def main(overrides: list[str]) -> None:
     settings = load_pipeline("troxel2023", overrides)
     start = time.perf_counter()
-    planned = plan(Survey(settings))
+    planned = running.plan(Survey(settings))
     print(f"plan: {time.perf_counter() - start:.0f} s")
-    # of what has no files neither a catalog nor spectra can be written
-    run_stages.write_catalog_files = run_stages.write_spectra = lambda *_: None
-    run_stages.catalog_files = run_stages.files_below = lambda *_: []
+    # units without files have neither catalog files nor spectra
+    run_stages.write_catalog_files = catalogs.write_spectra = lambda *_: None
+    run_stages.catalog_metadata_files = catalogs.files_below = lambda *_: []
     with tempfile.TemporaryDirectory() as name, runner(WORKERS, settings.run.memory_limit) as execution:
         store, idle = Store(Path(name)), Idle(execution)
         store.prepare()
         start = time.perf_counter()
-        summary = flow.run(settings, store, idle, Reporter(Console()))
+        summary = running.run(Survey(settings, store), idle, Reporter(Console()))
         total = time.perf_counter() - start
     assert not summary.failed, summary.failed[:3]
     hours, count = sum(row.hours for row in planned), sum(summary.made.values())

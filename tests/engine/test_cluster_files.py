@@ -18,16 +18,17 @@ from distributed import LocalCluster, Security
 from output_hashes import output_hashes
 from rich.console import Console
 
-from romandask import run as flow
+from romandask import run as running
 from romandask.engine.clients import InProcess, runner
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
-from romandask.stage_graph import Chosen
+from romandask.stage_graph import Selection
 from romandask.storage.store import Store
+from romandask.survey import Survey
 
 FILES = ROOT / "pipelines" / "cluster"
-SOME = Chosen(("truth", "pointings"))
+SOME = Selection(("truth", "pointings"))
 
 
 def content(name: str) -> dict:
@@ -63,7 +64,7 @@ def test_jobs_of_a_queue_make_the_same_over_tls(queue, tmp_path):
     pipeline = load_pipeline("tiny", list(MINI))
     place = Store(tmp_path / "here")
     place.prepare()
-    flow.run(pipeline, place, InProcess(), Reporter(Console(quiet=True)), SOME)
+    running.run(Survey(pipeline, place), InProcess(), Reporter(Console(quiet=True)), SOME)
     on_loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with (
         settings("workers", "slurm"),
@@ -84,9 +85,9 @@ def test_jobs_of_a_queue_make_the_same_over_tls(queue, tmp_path):
             assert "#SBATCH --mem=2560M" in job
             assert "#SBATCH -t 12:00:00" in job
             with pytest.raises(UserError, match=r"the cluster: a worker has 2\.00 GiB, run\.memory_limit is 3"):
-                flow.run_on(client, load_pipeline("tiny", [*MINI, "run.memory_limit=3"]), tmp_path / "none")
+                running.run_on(client, load_pipeline("tiny", [*MINI, "run.memory_limit=3"]), tmp_path / "none")
             assert not (tmp_path / "none").exists()
-            summary = flow.run_on(client, pipeline, tmp_path / "there", SOME)
+            summary = running.run_on(client, pipeline, tmp_path / "there", SOME)
     assert not summary.failed
     assert output_hashes(tmp_path / "there") == output_hashes(tmp_path / "here")
     assert len(output_hashes(tmp_path / "here")) >= 5

@@ -1,4 +1,4 @@
-"""The course of a run: stages begin when what they read is there, side by side, units of the first ones first."""
+"""Running stages: each begins when what it reads is there, side by side, units of the first ones first."""
 
 import io
 import time
@@ -13,11 +13,11 @@ import pytest
 from conftest import MINI
 from rich.console import Console
 
-from romandask import run as flow
+from romandask import run as running
 from romandask.engine.clients import InProcess, runner
 from romandask.engine.event_log import Log, events
 from romandask.engine.progress import Reporter
-from romandask.engine.run_stages import Run, run_stages
+from romandask.engine.run_stages import Run, RunnableStage, run_stages
 from romandask.engine.submission import IN_FLIGHT_PER_THREAD, Submission, submit_units
 from romandask.engine.task import Batch, Task
 from romandask.model.errors import UserError
@@ -26,7 +26,7 @@ from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.report.stage_diagram import _reduced, kinds_read
-from romandask.stage_graph import Stage, reads, stages, tier
+from romandask.stage_graph import STAGES, stage_products
 from romandask.storage.checksums import remove_checksums
 from romandask.storage.store import Store
 from romandask.survey import Survey
@@ -58,13 +58,14 @@ def stage_of(name, units, maker, inputs=(), seconds=0.0):
     product = TableProduct(
         name, tuple(Unit(f"u{k}", k, inputs) for k in range(units)), maker, SCHEMA, seconds_per_unit=seconds
     )
-    return Stage(name, lambda _: product)
+    reads = frozenset(stage for stage, _ in inputs)
+    return RunnableStage(name=name, product=lambda: product, reads=reads)
 
 
-def course(stages_, folder, execution=None):
+def happened_in(stages_, folder, execution=None):
     """Run some stages; return what happened, in order, as (event, stage, unit), and the summary."""
     store = Store(folder / "store")
-    this = Run(None, store, execution or InProcess(), Reporter(Console(file=io.StringIO())), Log(store.log), False)
+    this = Run(store, execution or InProcess(), Reporter(Console(file=io.StringIO())), Log(store.log), False)
     with this.ends:
         run_stages(stages_, this)
     found = [(one["event"], one["stage"], one.get("unit")) for one in events(store.log, this.log.name)]
@@ -80,7 +81,7 @@ def test_a_stage_that_reads_nothing_of_another_is_made_beside_it(tmp_path):
         stage_of("truth_index/x", 3, Waits(made=flag)),
     ]
     with runner(2, 1.5) as execution:
-        happened, summary = course(found, tmp_path, execution)
+        happened, summary = happened_in(found, tmp_path, execution)
     assert summary.made == {"coadds/x": 1, "detections/x": 2, "truth_index/x": 3}
     assert not summary.failed
     assert happened[:2] == [("stage", "coadds/x", None), ("stage", "truth_index/x", None)]
@@ -94,7 +95,7 @@ def test_in_one_process_stages_go_in_order(tmp_path):
         stage_of("detections/x", 2, Waits(), (("coadds/x", "u0"), ("coadds/x", "u1"))),
         stage_of("truth_index/x", 1, Waits()),
     ]
-    happened, _ = course(found, tmp_path)
+    happened, _ = happened_in(found, tmp_path)
     units = [stage for event, stage, _ in happened if event == "unit"]
     assert units == ["coadds/x", "coadds/x", "detections/x", "detections/x", "truth_index/x"]
 
@@ -103,19 +104,18 @@ def test_units_are_not_known_before_truth_and_pointings_are_there(tmp_path):
     """Though it reads nothing, a stage is not even put together before them."""
     asked, store = [], Store(tmp_path / "store")
 
-    def put_together(_):
+    def put_together():
         asked.append([*store.recorded("truth/stars"), *store.recorded("pointings/x")])
         return TableProduct("exposures/x", (Unit("u0", 0),), Waits(), SCHEMA)
 
     found = [
         stage_of("truth/stars", 1, Waits()),
         stage_of("pointings/x", 1, Waits()),
-        Stage("exposures/x", put_together),
+        RunnableStage(name="exposures/x", product=put_together, known_after=frozenset({"truth/stars", "pointings/x"})),
     ]
-    course(found, tmp_path)
+    happened_in(found, tmp_path)
     assert asked
     assert all(names == ["u0", "u0"] for names in asked), asked
-    assert [tier(stage.name) for stage in found] == [1, 1, 2]
 
 
 def test_what_fails_holds_up_only_what_needs_it(tmp_path):
@@ -124,7 +124,7 @@ def test_what_fails_holds_up_only_what_needs_it(tmp_path):
         stage_of("detections/x", 1, Waits(), (("coadds/x", "u1"),)),
         stage_of("shear/x", 1, Waits(), (("coadds/x", "u0"),)),
     ]
-    _, summary = course(found, tmp_path)
+    _, summary = happened_in(found, tmp_path)
     assert summary.failed == ["coadds/x/u1", "detections/x/u0 (an input is missing)"]
     assert summary.made == {"coadds/x": 1, "detections/x": 0, "shear/x": 1}
 
@@ -132,7 +132,7 @@ def test_what_fails_holds_up_only_what_needs_it(tmp_path):
 def test_stages_that_wait_for_one_another_are_no_quiet_end(tmp_path):
     found = [stage_of("a/x", 1, Waits(), (("b/x", "u0"),)), stage_of("b/x", 1, Waits(), (("a/x", "u0"),))]
     with pytest.raises(RuntimeError, match="wait for one another: a/x, b/x"):
-        course(found, tmp_path)
+        happened_in(found, tmp_path)
 
 
 class Future(SimpleNamespace):
@@ -200,7 +200,7 @@ def test_nothing_goes_on_when_the_store_can_take_no_more(tmp_path, monkeypatch):
     found = [stage_of("coadds/x", 1, Waits(bad=(0,))), stage_of("truth_index/x", 40, Waits(wanted=tmp_path / "never"))]
     with runner(1, 1.5) as execution:
         with pytest.raises(UserError, match="no space left"):
-            course(found, tmp_path, execution)
+            happened_in(found, tmp_path, execution)
         deadline = time.monotonic() + 30
         while execution._client.futures and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -214,24 +214,24 @@ def test_what_a_run_was_stopped_before_it_could_seal_is_written_again(tmp_path, 
     monkeypatch.setattr(
         "romandask.engine.run_stages.write_catalog_files", lambda product, *_: written.append(product.stage)
     )
-    monkeypatch.setattr("romandask.engine.run_stages.catalog_files", lambda *_: [])
-    (one,) = [replace(stage_of("objects/x", 1, Waits()), position=("ra", "dec"))]
-    course([one], tmp_path)
+    monkeypatch.setattr("romandask.engine.run_stages.catalog_metadata_files", lambda *_: [])
+    (one,) = [replace(stage_of("objects/x", 1, Waits()), sky=("ra", "dec"))]
+    happened_in([one], tmp_path)
     assert written == ["objects/x"]
     store = Store(tmp_path / "store")
     (store.catalog("objects/x")).mkdir(parents=True, exist_ok=True)
     (store.catalog("objects/x") / "hats.properties").touch()
-    course([one], tmp_path)
+    happened_in([one], tmp_path)
     assert written == ["objects/x"], "nothing was made, nothing is written"
     remove_checksums(store, "objects/x")
-    course([one], tmp_path)
+    happened_in([one], tmp_path)
     assert written == ["objects/x"] * 2
 
 
 def test_what_units_read_is_there_when_they_are_made(tmp_path, monkeypatch):
     """A stage that began too early would make what it reads by itself: slowly, and in memory that nobody planned."""
     pipeline = load_pipeline("tiny", [*MINI, "roman.detector=sca"])
-    known = {stage.name for stage in stages(Survey(pipeline))}
+    known = {one.name for one in stage_products(Survey(pipeline))}
 
     def checked(kind, name):
         method = getattr(kind, name)
@@ -245,25 +245,52 @@ def test_what_units_read_is_there_when_they_are_made(tmp_path, monkeypatch):
 
     for kind, name in ((TableProduct, "load"), (TableProduct, "select"), (ImageProduct, "load")):
         checked(kind, name)
-    store = Store(tmp_path / "store")
-    store.prepare()
-    summary = flow.run(pipeline, store, InProcess(), Reporter(Console(file=io.StringIO())))
+    survey = Survey(pipeline, Store(tmp_path / "store"))
+    survey.store.prepare()
+    summary = running.run(survey, InProcess(), Reporter(Console(file=io.StringIO())))
     assert not summary.failed
     assert set(summary.made) == known
 
 
-def test_no_product_is_made_from_what_does_not_come_before_it():
-    """The order of the stages is one in which they can run, whatever a survey has."""
-    for name in ("tiny", "one_tile", "joint_tile"):
-        survey = Survey(load_pipeline(name))
+EVERY_OPTION = [
+    ("tiny",),
+    ("tiny", "roman.detector=sca"),
+    ("tiny", "roman.detector=sca", "rubin.mode=visits"),
+    ("one_tile",),
+    ("joint_tile",),
+]
+
+
+@pytest.mark.parametrize("settings", EVERY_OPTION, ids=" ".join)
+def test_units_read_what_their_stage_declares(settings):
+    """The declarations decide when a stage begins: a unit that read anything else might be made before it is there."""
+    survey = Survey(load_pipeline(settings[0], list(settings[1:])))
+    for one in stage_products(survey):
+        product = survey.product(one.name)
+        assert product.stage == one.name
+        units = product.units[:: max(1, len(product.units) // 50)]
+        read = {stage for unit in units for stage, _ in (*unit.inputs, *unit.optional)}
+        assert read <= one.reads, one.name
+
+
+def test_units_of_source_catalogs_read_what_their_stage_declares(shared):
+    survey = Survey(load_pipeline("dc2_sample", [f"data={shared}"]))
+    for one in stage_products(survey):
+        read = {stage for unit in survey.product(one.name).units for stage, _ in (*unit.inputs, *unit.optional)}
+        assert read <= one.reads, one.name
+
+
+def test_the_order_of_the_stages_is_one_in_which_they_can_run():
+    for settings in EVERY_OPTION:
         before = set()
-        for stage in stages(survey):
-            assert reads(stage.product(survey)) - {stage.name} <= before, stage.name
-            before.add(stage.name)
+        for one in stage_products(Survey(load_pipeline(settings[0], list(settings[1:])))):
+            assert one.reads | one.known_after <= before, one.name
+            before.add(one.name)
+    assert len({stage.name for stage in STAGES}) == len(STAGES)
 
 
 def test_the_picture_of_the_stages_is_what_they_read():
-    arrows = _reduced(kinds_read(Survey(load_pipeline("tiny"))))
+    arrows = _reduced(kinds_read(stage_products(Survey(load_pipeline("tiny")))))
     assert arrows["exposures"] == {"truth", "pointings"}
     assert arrows["coadds"] == {"exposures"}, "what exposures read need not be drawn again"
     assert arrows["differences"] == arrows["truth_match"] == {"detections"}
@@ -271,7 +298,7 @@ def test_the_picture_of_the_stages_is_what_they_read():
     assert arrows["statistics"] == {"matches", "chance"}
     assert not arrows["truth"]
     assert not arrows["pointings"]
-    arrows = _reduced(kinds_read(Survey(load_pipeline("tiny", ["roman.detector=sca"]))))
+    arrows = _reduced(kinds_read(stage_products(Survey(load_pipeline("tiny", ["roman.detector=sca"])))))
     assert arrows["exposures"] == {"truth", "calibration"}
     assert arrows["calibration"] == {"pointings"}
     assert arrows["coadds"] == {"exposures"}

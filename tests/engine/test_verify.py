@@ -15,9 +15,10 @@ import yaml
 from conftest import MINI, command
 
 from romandask.cli.main import main
-from romandask.engine.verify import BESIDE, verify
+from romandask.engine.verify import BESIDE
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
+from romandask.run import verify_store
 from romandask.storage.manifest import digest
 from romandask.storage.store import Store, refuse_full
 from romandask.survey import open_survey
@@ -55,7 +56,7 @@ def stage_of(store: Path, path: Path) -> str:
 
 
 def damaged(store: Path, stage: str) -> list[str]:
-    return [name for found in verify(open_survey(store), stage) for name, _ in found.damaged]
+    return [name for found in verify_store(open_survey(store), stage) for name, _ in found.damaged]
 
 
 def test_a_store_is_as_it_was_written(store):
@@ -63,7 +64,7 @@ def test_a_store_is_as_it_was_written(store):
     assert done.returncode == 0, done.stdout
     assert "units are as they were written" in done.stdout
     every = {stage_of(store, path) for path in stored(store)}
-    known = {found.stage for found in verify(open_survey(store))}
+    known = {found.stage for found in verify_store(open_survey(store))}
     assert every <= known | set(BESIDE)
     assert {"exposures/roman", "coadds/rubin", "truth/galaxies_margin", "matches/groups"} <= every
 

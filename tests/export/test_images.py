@@ -31,7 +31,7 @@ def survey(tiny_store):
 
 def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
     """What astropy reads is what the store has, where the WCS of the store says."""
-    roman = survey.exposure_product("roman")
+    roman = survey.output("exposures/roman")
     tile = survey.tiles[0].name
     (one,) = export_fits(survey, tmp_path, "roman", [roman.names[1]], [], [])
     (two,) = export_fits(survey, tmp_path, "rubin", [], [tile], ["i"])
@@ -69,7 +69,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
 
 def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
     """roman_datamodels reads and validates them; their gwcs is the FITS WCS; a star has the flux that it had."""
-    product = survey.exposure_product("roman")
+    product = survey.output("exposures/roman")
     (path,) = export_asdf(survey, tmp_path, [product.names[1]])
     stored, exposure = product.load(1), exposure_of(survey.pointings("roman").iloc[1])
     instrument = survey.instruments["roman"]
@@ -104,7 +104,7 @@ def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
     tile = survey.tiles[0]
     (path,) = export_mosaics(survey, tmp_path, [tile.name], ["H158"])
     coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
-    product = survey.coadd_product("roman")
+    product = survey.output("coadds/roman")
     sets = product.load(product.names.index(f"{tile.name}-H158"), ("sets",))["sets"]
     with rdm.open(path) as model:
         assert isinstance(model, rdm.datamodels.MosaicModel)
@@ -150,8 +150,8 @@ def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
 
 
 def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
-    roman, rubin = survey.coadd_product("roman"), survey.coadd_product("rubin")
-    exposures = survey.exposure_product("roman")
+    roman, rubin = survey.output("coadds/roman"), survey.output("coadds/rubin")
+    exposures = survey.output("exposures/roman")
     count = export_obscore(survey, tmp_path / "images.vot")
     assert count == len(exposures.names) + len(roman.names) + len(rubin.names)
     table = Table.read(tmp_path / "images.vot", format="votable")

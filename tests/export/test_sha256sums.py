@@ -22,7 +22,7 @@ def exported(tiny_store, tmp_path_factory):
     out = tmp_path_factory.mktemp("exported")
     with dask.config.set(scheduler="synchronous"):
         survey = open_survey(tiny_store)
-        tile, exposure = survey.tiles[0], survey.exposure_product("roman").names[0]
+        tile, exposure = survey.tiles[0], survey.output("exposures/roman").names[0]
         written = export_fits(survey, out, "rubin", [], [tile.name], ["i"])
         written += export_mosaics(survey, out, [tile.name], ["H158"])
         written += export_truth(survey, out)

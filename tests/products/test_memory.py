@@ -10,7 +10,7 @@ import pytest
 from conftest import command
 
 from romandask.products.memory import INTERPRETER
-from romandask.stage_graph import stages
+from romandask.stage_graph import stage_products
 from romandask.storage.manifest import read_records
 from romandask.survey import open_survey
 
@@ -49,8 +49,8 @@ def test_no_unit_takes_more_than_its_stage_states(case, tmp_path):
     done = command("run", pipeline, "--store", "s", "--workers", "1", *overrides, *THIN, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     survey, over = open_survey(tmp_path / "s"), {}
-    for stage in stages(survey):
-        states = stage.product(survey).bytes_per_unit + INTERPRETER
+    for stage in stage_products(survey):
+        states = survey.product(stage.name).bytes_per_unit + INTERPRETER
         for name, record in read_records(survey.store, stage.name):
             if record.peak_bytes > states:
                 over[f"{stage.name}/{name}"] = (record.peak_bytes / 2**30, states / 2**30)

@@ -46,7 +46,7 @@ def star(survey) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", ["roman", "rubin"])
 def test_a_picture_has_the_pixels_of_the_tiles_that_own_its_places(survey, name):
-    layer = Layer(survey.coadd_product(name), _plane(survey))
+    layer = Layer(survey.output(f"coadds/{name}"), _plane(survey))
     row, column = 0, 0
     planes = layer.sampled(row, column)
     ra, dec = layer.plane.sky(layer.finest, row, column)

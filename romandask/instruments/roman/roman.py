@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Annotated, Literal
@@ -13,6 +14,7 @@ import pandas as pd
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from romandask.instruments.instrument import WHOLE, Exposure, pixel_areas
+from romandask.instruments.roman.calibration import calibrations
 from romandask.instruments.roman.calibration_source import CalibrationSource
 from romandask.instruments.roman.focal_plane import SCAS, corners, header_of
 from romandask.instruments.roman.optics import (
@@ -34,6 +36,7 @@ from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman
 from romandask.model.settings import Section, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
+from romandask.products.images import ImageProduct
 
 _NEAR = 256
 """Pixels, a side, that the PSF of one place covers."""
@@ -129,6 +132,15 @@ class Roman:
         """How PSFs vary over an SCA, of which stars they are finer, and the diffusion of charge."""
         settings = self.settings.model_dump(include={"psf_degree", "bright_stars", "charge_diffusion"})
         return {**settings, "detector": self.settings.detector}
+
+    @property
+    def calibrated(self) -> bool:
+        """True with the full model of the detectors."""
+        return self.calibration is not None
+
+    def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
+        """Return the lazy calibrations of some SCAs, with the full model of the detectors."""
+        return None if self.calibration is None else calibrations(self.calibration, detectors)
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Annotated, Literal
@@ -30,6 +31,7 @@ from romandask.model.seeds import rng
 from romandask.model.settings import Section, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
+from romandask.products.images import ImageProduct
 
 SCALE = 0.2
 """arcsec a pixel"""
@@ -122,6 +124,15 @@ class Rubin:
     def coadd(self) -> Literal["draw", "warp"]:
         """Whether tiles are drawn from the cadence, or made of its exposures."""
         return "draw" if self.settings.mode == "coadd" else "warp"
+
+    @property
+    def calibrated(self) -> bool:
+        """False: amplifiers are made up from the seed."""
+        return False
+
+    def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
+        """Return None."""
+        return None
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""

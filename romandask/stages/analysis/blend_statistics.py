@@ -6,7 +6,7 @@ An unrecognised blend is a group with one object of Rubin and two or more of Rom
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,17 @@ from romandask.products.hats import rows_around
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.friends_of_friends import CODES, Matches, length_name
+from romandask.stages.analysis.friends_of_friends import (
+    CODES,
+    Matches,
+    chance_of,
+    has_joint_analysis,
+    length_name,
+    matches_of,
+)
+from romandask.stages.detections.truth_match import reference_band
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
+from romandask.stages.truth.catalogs import truth_of
 
 MAG_EDGES = np.arange(18.0, 28.01, 0.5)
 """Bins of i magnitude."""
@@ -296,3 +306,51 @@ class _Distributions(_Table):
             ],
             ignore_index=True,
         )
+
+
+def statistics_of(context: SurveyContext) -> Statistics:
+    """Return the tables of the statistics of a survey's groups."""
+    truth = context.once(truth_of)
+    known = Samples(
+        {name: context.output(f"samples/{name}") for name in SURVEYS},
+        {name: reference_band(context.instruments[name]) for name in SURVEYS},
+        truth.galaxies,
+        truth.stars,
+    )
+    lengths = context.pipeline.matches.linking_lengths
+    found = statistics(context.once(matches_of), context.once(chance_of), known, lengths)
+    store = context.store
+    return found if store is None else Statistics(*(table.stored(store) for table in vars(found).values()))
+
+
+def _stage(part: str, build: Callable[[Statistics], TableProduct], kind: str, schema_: str, summary: str) -> Stage:
+    return Stage(
+        name=f"statistics/{part}",
+        build=lambda context, _: build(context.once(statistics_of)),
+        exists=has_joint_analysis,
+        reads=(f"{kind}/groups", f"{kind}/merged", "samples", "truth/galaxies", "truth/stars"),
+        units_known_after=UNITS_FROM_POINTINGS,
+        unit="survey",
+        summary=summary,
+        tables={schema_: f"statistics/{part}/"},
+    )
+
+
+STATISTICS = (
+    _stage("blends", lambda s: s.blends, "matches", "blends", "Blend matrix: groups by numbers of objects."),
+    _stage(
+        "unrecognised",
+        lambda s: s.unrecognised,
+        "matches",
+        "unrecognised",
+        "Unrecognised blends by magnitude, and how many of them are real.",
+    ),
+    _stage(
+        "distributions",
+        lambda s: s.distributions,
+        "matches",
+        "distributions",
+        "Colours and sizes of blends and of single objects.",
+    ),
+    _stage("chance", lambda s: s.chance, "chance", "unrecognised", "Unrecognised blends that chance makes."),
+)

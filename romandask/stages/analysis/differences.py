@@ -11,6 +11,7 @@ from astropy.wcs import WCS
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map
 from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.kernels.measurement.difference import Matched, blurred, dipoles, match, matching_kernel
+from romandask.model.errors import UserError
 from romandask.model.settings import DifferenceSettings
 from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
@@ -18,6 +19,7 @@ from romandask.products.units import Unit
 from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
 from romandask.stages.detections.tile_bands import TileBands
 from romandask.stages.exposures import RenderExposure
+from romandask.stages.stage import Stage, SurveyContext
 from romandask.storage.arrays import Variable
 
 ROWS = 128
@@ -202,3 +204,45 @@ def residual_table(objects: pd.DataFrame, left: np.ndarray, band: str) -> pd.Dat
     flux = {name: objects[f"{band}_{name}"].to_numpy() for name in ("psfFlux", "psfFluxErr")}
     frame = pd.DataFrame({**columns, **flux, **dict(zip(names, left.T, strict=True))})
     return frame[np.isfinite(left).all(axis=1)].reset_index(drop=True)
+
+
+def _template_survey(context: SurveyContext) -> str | None:
+    """Return the survey that has the template's band; None where none has."""
+    band = context.pipeline.differences.template
+    return next((name for name, one in context.instruments.items() if band in one.bands), None)
+
+
+def has_differences(context: SurveyContext, survey: str) -> bool:
+    """Return whether a survey has the science band, and one the template's."""
+    bands = context.instruments[survey].bands
+    return context.pipeline.differences.science in bands and _template_survey(context) is not None
+
+
+def build_differences(context: SurveyContext, survey: str) -> ImageProduct:
+    """Return the lazy difference images of a survey's coadds and those of the template's survey.
+
+    Raises
+    ------
+    UserError
+        If the survey does not have both bands.
+    """
+    settings, template = context.pipeline.differences, _template_survey(context)
+    if template is None or not has_differences(context, survey):
+        raise UserError(f"difference images need {settings.template} of Roman and {settings.science} of Rubin")
+    coadds = context.output(f"coadds/{template}"), context.output(f"coadds/{survey}")
+    return differences(*coadds, context.output(f"detections/{survey}"), settings)
+
+
+DIFFERENCES = Stage(
+    name="differences",
+    per_survey=True,
+    build=build_differences,
+    exists=has_differences,
+    reads=("coadds/*", "detections"),
+    units_known_after=("pointings/*", "truth/ingested"),
+    unit="tile",
+    summary="A band of one survey (Rubin's y) less a band of a sharper one (Roman's Y106), matched to its PSF, and "
+    "what is left of bright objects.",
+    shrink_with="lower coadds.pixels",
+    tables={"residuals": "differences/<survey>_residuals/"},
+)

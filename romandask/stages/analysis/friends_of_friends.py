@@ -7,7 +7,9 @@ piece, whatever the partitions; shorter linking lengths than the longest are the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +22,7 @@ from romandask.products.hats import RIM, RIM_ORDER, inner_rim, rim
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.store import Store
 
 SHIFT = 13.0
@@ -261,3 +264,74 @@ class _Name:
         for length in self.lengths:
             frame[f"group_{length_name(length)}"] = group_of(frame, merged, length)
         return frame
+
+
+def has_joint_analysis(context: SurveyContext, survey: str) -> bool:
+    """Return whether a survey has both instruments whose blends are counted."""
+    return {"roman", "rubin"} <= set(context.instruments)
+
+
+def matches_of(context: SurveyContext) -> Matches:
+    """Return the stages of friends of friends over the samples."""
+    return _joined(context, "matches", 0.0)
+
+
+def chance_of(context: SurveyContext) -> Matches:
+    """Return the same of a sky in which one survey is moved: its groups are by chance."""
+    return _joined(context, "chance", SHIFT)
+
+
+def _joined(context: SurveyContext, kind: str, shift: float) -> Matches:
+    tables = {name: context.output(f"samples/{name}") for name in context.instruments}
+    return matches(tables, context.pipeline.matches, context.region, context.store, kind, shift)
+
+
+def _stages(kind: str, products: Callable[[SurveyContext], Matches], about: str) -> tuple[Stage, ...]:
+    def stage(part: str, build: Callable[[Matches], TableProduct], reads: tuple[str, ...], **more: Any) -> Stage:
+        return Stage(
+            name=f"{kind}/{part}",
+            build=lambda context, _: build(context.once(products)),
+            exists=has_joint_analysis,
+            reads=reads,
+            units_known_after=UNITS_FROM_POINTINGS,
+            shrink_with="raise matches.order",
+            tables={part: f"{kind}/{part}/"},
+            **more,
+        )
+
+    return (
+        stage(
+            "local",
+            lambda found: found.local,
+            ("samples",),
+            unit="HEALPix cell",
+            summary=f"Minimum spanning forest of the objects of a cell{about}.",
+        ),
+        stage(
+            "crossing",
+            lambda found: found.crossing,
+            ("samples",),
+            unit="HEALPix cell",
+            summary=f"Links of its objects with those outside{about}.",
+        ),
+        stage(
+            "merged",
+            lambda found: found.merged,
+            (f"{kind}/local", f"{kind}/crossing"),
+            unit="survey",
+            summary=f"The forest of the groups that cross cells{about}.",
+        ),
+        stage(
+            "groups",
+            lambda found: found.groups,
+            (f"{kind}/local", f"{kind}/merged"),
+            unit="HEALPix cell",
+            summary="Friends of friends over the samples of both surveys, whatever the partitions; every shorter "
+            f"linking length is a cut of the forest{about}.",
+            sky=("coord_ra", "coord_dec"),
+        ),
+    )
+
+
+MATCHES = _stages("matches", matches_of, "")
+CHANCE = _stages("chance", chance_of, ", one survey moved: what chance makes")

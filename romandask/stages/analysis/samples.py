@@ -9,11 +9,14 @@ import pandas as pd
 
 from romandask.kernels.measurement.counts import counts_limit
 from romandask.kernels.measurement.extract import FLAGS
+from romandask.model.errors import UserError
 from romandask.model.settings import MatchSettings
 from romandask.model.spectra import ab_magnitude
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import LazyUnits, Unit
+from romandask.stages.detections.truth_match import REFERENCE_BANDS, reference_band
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 
 ALLOWED = FLAGS["deblended"] | FLAGS["kron_nonpositive"]
 """Flags that clean objects may have: of Source Extractor's 1 and 2, which Troxel et al. (2023) allow, sep has one; that
@@ -131,3 +134,51 @@ class _Sample:
             return frame
         faintest = float(self.limit.load(0)["limit"].iloc[0])
         return frame[frame["clean"] & (frame[f"{self.band}_mag"] <= faintest)].reset_index(drop=True)
+
+
+def build_limits(context: SurveyContext, survey: str) -> TableProduct:
+    """Return the lazy magnitude limit of an instrument's sample.
+
+    Raises
+    ------
+    UserError
+        If `matches.limits` names a band that is no reference band.
+    """
+    settings = context.pipeline.matches
+    bands = {reference_band(instrument) for instrument in context.instruments.values()}
+    # one pipeline's limits also serve its runs with a survey, or that band, left out
+    if unknown := set(settings.limits or {}) - {*bands, *REFERENCE_BANDS}:
+        raise UserError(f"matches.limits: {', '.join(sorted(unknown))}: they are those of {', '.join(sorted(bands))}")
+    tables = context.output(f"objects/{survey}"), context.output(f"truth_match/{survey}")
+    return limits(*tables, settings, reference_band(context.instruments[survey]))
+
+
+def build_samples(context: SurveyContext, survey: str) -> TableProduct:
+    """Return the lazy sample of an instrument's objects."""
+    instrument = context.instruments[survey]
+    tables = (context.output(f"{stage}/{survey}") for stage in ("objects", "truth_match", "limits"))
+    return samples(*tables, context.pipeline.matches, instrument.bands, reference_band(instrument))
+
+
+LIMITS = Stage(
+    name="limits",
+    per_survey=True,
+    build=build_limits,
+    reads=("objects", "truth_match"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="survey",
+    summary="The magnitude at which counts of clean objects fall to 80% of a power law.",
+    tables={"limits": "limits/<survey>/"},
+)
+SAMPLES = Stage(
+    name="samples",
+    per_survey=True,
+    build=build_samples,
+    reads=("objects", "truth_match", "limits"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="HEALPix cell",
+    summary="Clean objects to that limit, with dereddened magnitudes and their true counterparts.",
+    sky=("coord_ra", "coord_dec"),
+    shrink_with="raise detections.order",
+    tables={"samples": "samples/<survey>/"},
+)

@@ -21,6 +21,8 @@ from romandask.products.hats import rows_around
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
+from romandask.stages.truth.catalogs import truth_of
 from romandask.storage.store import Store
 
 ARCMIN = np.radians(1 / 60)
@@ -350,3 +352,43 @@ def jackknife(sums: pd.DataFrame, bins: int) -> np.ndarray:
         found.append(np.stack([xip, xim]) / np.where(weight > 0, weight, np.nan))
     samples = np.array(found)
     return np.sqrt((count - 1) / count * ((samples - samples.mean(axis=0)) ** 2).sum(axis=0))
+
+
+def build_lensing(context: SurveyContext, survey: str) -> Lensing:
+    """Return the stages of the two-point functions of an instrument's sample."""
+    galaxies = context.once(truth_of).galaxies
+    return lensing(
+        context.output(f"samples/{survey}"), galaxies, context.pipeline.lensing, context.region, context.store
+    )
+
+
+SHAPES = Stage(
+    name="shapes",
+    per_survey=True,
+    build=lambda context, survey: context.once(build_lensing, survey).shapes,
+    reads=("samples", "truth/galaxies"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="HEALPix cell",
+    summary="Lensed shapes of the true galaxies of the sample.",
+    tables={"shapes": "shapes/<survey>/"},
+)
+SHEAR_PAIRS = Stage(
+    name="shear_pairs",
+    per_survey=True,
+    build=lambda context, survey: context.once(build_lensing, survey).pairs,
+    reads=("shapes",),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="patch of the sky",
+    summary="Sums over the pairs of galaxies of a patch, and of it with each later patch (TreeCorr).",
+    tables={"pairs": "shear_pairs/<survey>/"},
+)
+SHEAR = Stage(
+    name="shear",
+    per_survey=True,
+    build=lambda context, survey: context.once(build_lensing, survey).shear,
+    reads=("shapes", "shear_pairs"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="survey",
+    summary="xi+ and xi- of true shapes, with Gaussian covariance, jackknife and theory.",
+    tables={"shear": "shear/<survey>/"},
+)

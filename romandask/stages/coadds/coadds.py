@@ -26,6 +26,7 @@ from romandask.stages.coadds.tile_maker import TileMaker, source_of
 from romandask.stages.coadds.warped import WarpTile
 from romandask.stages.exposures import cone, header_text
 from romandask.stages.pointings import corners_of
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.arrays import Variable
 from romandask.storage.manifest import digest
 
@@ -141,3 +142,22 @@ def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Vari
         text = "unit star of flat f_nu of each exposure, as it is drizzled"
         found.append(Variable("input_psf", "float32", (inputs, psf, psf), ("input", "v", "u"), {"long_name": text}))
     return tuple(found)
+
+
+def build_coadds(context: SurveyContext, survey: str) -> ImageProduct:
+    """Return the lazy coadds of an instrument."""
+    return coadds(context.output(f"exposures/{survey}"), context.tiles, context.pipeline.coadds)
+
+
+COADDS = Stage(
+    name="coadds",
+    per_survey=True,
+    build=build_coadds,
+    reads=("exposures", "truth/galaxies", "truth/stars"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="tile and band",
+    summary="Image, weight, noise realisations, number and sets of exposures, PSFs: drizzled from exposures (square "
+    "kernel, exact overlaps), warped from visits, or drawn from the cadence at its depth.",
+    shrink_with="lower coadds.pixels",
+    tables={"sets": "coadds/<survey>_sets/"},
+)

@@ -21,17 +21,16 @@ from romandask.kernels.measurement.extract import (
 )
 from romandask.kernels.universe.synthetic_photometry import extinction
 from romandask.model.settings import DetectionSettings
-from romandask.model.sky import Region, cells_in_cone, unit_vectors
+from romandask.model.sky import Region, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
 from romandask.products.hats import with_spatial_index
 from romandask.products.images import ImageProduct
 from romandask.products.memory import release_free_memory
 from romandask.products.schemas import schema
-from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
 from romandask.stages.detections.tile_bands import TileBands
-from romandask.stages.detections.zero_points import corrected
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.arrays import Variable
 
 EXTENDED = 1.15
@@ -75,46 +74,6 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
         bytes_per_unit=pixels**2 * 13 + (420 << 20),
         seconds_per_unit=pixels**2 * 7e-7,
         tables={"objects": schema("objects", bands)},
-    )
-
-
-def objects(
-    detections: ImageProduct,
-    coadds: ImageProduct,
-    settings: DetectionSettings,
-    region: Region,
-    zero: TableProduct | None = None,
-) -> TableProduct:
-    """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS).
-
-    Parameters
-    ----------
-    zero : offsets of the magnitudes (`zero_points()`), to be taken out; None leaves fluxes as they were measured
-    """
-    maker = tile_maker(coadds)
-    radius = maker.settings.grid().inner / 3600 * 0.75
-    cells = region.cells(settings.order)
-    tiles_of: dict[int, list[int]] = {int(cell): [] for cell in cells}
-    for k, tile in enumerate(maker.tiles):
-        for cell in cells_in_cone(tile.ra, tile.dec, radius, settings.order):
-            if int(cell) in tiles_of:
-                tiles_of[int(cell)].append(k)
-    units = tuple(
-        Unit(
-            f"{settings.order}-{cell}",
-            {"order": settings.order, "cell": cell},
-            (*((detections.stage, detections.names[k]) for k in members), *(((zero.stage, "all"),) if zero else ())),
-        )
-        for cell, members in tiles_of.items()
-    )
-    return TableProduct(
-        f"objects/{maker.instrument.name}",
-        units,
-        CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
-        detections.tables["objects"],
-        tuple(tiles_of),
-        settings.order,
-        400 << 20,
     )
 
 
@@ -210,23 +169,20 @@ def measure(
     return with_spatial_index(frame, "coord_ra", "coord_dec")
 
 
-@dataclass(frozen=True)
-class CollectPartition:
-    """Makes one HEALPix partition of an object table from the tiles that reach into it."""
+def build_detections(context: SurveyContext, survey: str) -> ImageProduct:
+    """Return the lazy detections of an instrument."""
+    return detections(context.output(f"coadds/{survey}"), context.pipeline.detections, context.region)
 
-    detections: ImageProduct
-    cells: tuple[int, ...]
-    members: tuple[tuple[int, ...], ...]
-    order: int
-    zero: TableProduct | None = None
 
-    def __call__(self, index: int) -> pd.DataFrame:
-        """Return the objects of the partition, by _healpix_29."""
-        parts = [self.detections.load(k, ("objects",))["objects"] for k in self.members[index]]
-        shift = 2 * (29 - self.order)
-        parts = [part[part["_healpix_29"].to_numpy() >> shift == self.cells[index]] for part in parts]
-        filled = [part for part in parts if len(part)]
-        if not filled:
-            return self.detections.tables["objects"].empty_table().to_pandas()
-        found = pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
-        return found if self.zero is None else corrected(found, self.zero.load(0))
+DETECTIONS = Stage(
+    name="detections",
+    per_survey=True,
+    build=build_detections,
+    reads=("coadds", "truth/galaxies", "truth/stars"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="tile",
+    summary="Segmentation and objects, on the median of bands (Source Extractor's method) or on peaks of their "
+    "PSF-smoothed mean; forced Kron, aperture and PSF photometry with the errors of correlated noise.",
+    shrink_with="lower coadds.pixels",
+    tables={"objects": "detections/<survey>_objects/"},
+)

@@ -19,6 +19,7 @@ from romandask.products.units import Unit
 from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
 from romandask.stages.detections.detections import DetectTile, owned, tile_cone
 from romandask.stages.exposures import RenderExposure
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 BINS = np.arange(17.0, 30.01, 0.5)
 """Magnitudes between which completeness and purity are counted."""
@@ -166,3 +167,27 @@ def _makers(detections: ImageProduct) -> tuple[DetectTile, TileMaker, RenderExpo
     assert isinstance(maker, DetectTile)
     tiles = tile_maker(maker.coadds)
     return maker, tiles, tiles.source
+
+
+TRUTH_MATCH = Stage(
+    name="truth_match",
+    per_survey=True,
+    build=lambda context, survey: truth_match(context.output(f"detections/{survey}"), context.pipeline.detections),
+    reads=("detections", "truth/galaxies", "truth/stars"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="tile",
+    summary="The true counterpart of each object within an arcsecond.",
+    tables={"truth_match": "truth_match/<survey>/"},
+)
+TRUTH_SUMMARY = Stage(
+    name="truth_summary",
+    per_survey=True,
+    build=lambda context, survey: truth_summary(
+        context.output(f"truth_match/{survey}"), context.output(f"detections/{survey}"), context.pipeline.detections
+    ),
+    reads=("truth_match", "truth/galaxies", "truth/stars"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="tile",
+    summary="The true objects of a tile, and which of them were detected.",
+    tables={"truth_summary": "truth_summary/<survey>/"},
+)

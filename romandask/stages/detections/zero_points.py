@@ -12,6 +12,7 @@ from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 BRIGHT, FAINT = 17.0, 20.0
 """True magnitudes of the stars that calibrate (Troxel et al. 2023, section 5.3)."""
@@ -90,3 +91,19 @@ class MakeZeroPoints:
             objects = objects[objects["flags"] == 0]
             parts.append(summary[["objectId", *true]].merge(objects[["objectId", *measured]], on="objectId"))
         return offsets(pd.concat(parts, ignore_index=True), self.bands)
+
+
+ZERO_POINTS = Stage(
+    name="zero_points",
+    per_survey=True,
+    build=lambda context, survey: zero_points(
+        context.output(f"truth_summary/{survey}"),
+        context.output(f"detections/{survey}"),
+        context.instruments[survey].bands,
+    ),
+    reads=("truth_summary", "detections"),
+    units_known_after=UNITS_FROM_POINTINGS,
+    unit="survey",
+    summary="Median of measured less true magnitudes of stars of 17 to 20 mag, by which fluxes are corrected.",
+    tables={"zero_points": "zero_points/<survey>/"},
+)

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from romandask.ingest import spectra as spectra_files
 from romandask.kernels.rendering.scene import Truth, bind
 from romandask.kernels.universe.synthetic_photometry import Dust
+from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region, cell_area, cells_in_cone, unit_vectors
 from romandask.model.spectra import Bandpass, SpectrumLibrary
@@ -20,11 +21,12 @@ from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.stage import Stage, SurveyContext
 from romandask.stages.truth.generated import GenerateGalaxies, GenerateStars, NothingSetAside, matter, templates
 from romandask.stages.truth.ingested import Assemble, Quarantine, edges_of, ingested_rows, open_sources, scan_rows
 from romandask.storage.arrays import write_coordinate, write_group
 from romandask.storage.manifest import digest
-from romandask.storage.paths import AnyPath, resolve_below
+from romandask.storage.paths import AnyPath, files_below, resolve_below
 from romandask.storage.store import Store
 
 WIDE = 1e7
@@ -46,7 +48,7 @@ class TruthCatalogs:
     quarantine: TableProduct
     structure: ImageProduct | None
     """Matter of a generated universe."""
-    ingested_rows: TableProduct | None
+    ingested: TableProduct | None
     """Rows of source catalogs."""
     library: SpectrumLibrary
     edges: tuple[float, ...]
@@ -230,6 +232,81 @@ def _tables(
         )
 
     return table
+
+
+def truth_of(context: SurveyContext) -> TruthCatalogs:
+    """Return the truth catalogs of a survey."""
+    settings = context.pipeline
+    rows = None if settings.truth.source == "generate" else context.output("truth/ingested")
+    return truth(settings.truth, context.data, context.region, context.bandpasses, settings.seed, context.store, rows)
+
+
+def _structure(context: SurveyContext, survey: str) -> ImageProduct:
+    structure = context.once(truth_of).structure
+    if structure is None:
+        raise UserError("this survey has no matter field: its truth is read from source catalogs")
+    return structure
+
+
+def _write_spectra(context: SurveyContext, store: Store) -> tuple[str, list[AnyPath]]:
+    write_spectra(context.once(truth_of), store)
+    return "truth/seds", files_below(store.images("truth/seds"))
+
+
+def _generated_truth(context: SurveyContext, survey: str) -> bool:
+    return context.pipeline.truth.source == "generate"
+
+
+STRUCTURE = Stage(
+    name="truth/structure",
+    build=_structure,
+    exists=_generated_truth,
+    unit="survey",
+    summary="Matter shells of the generated universe on the sky, with their convergence and shear.",
+    shrink_with="lower truth.nside",
+)
+INGESTED = Stage(
+    name="truth/ingested",
+    build=lambda context, _: ingested_rows(open_sources(context.pipeline.truth, context.data)),
+    exists=lambda context, survey: not _generated_truth(context, survey),
+    unit="batch of rows of a source catalog",
+    summary="Rows of source catalogs in one normal form, bad rows marked with the reason.",
+    tables={"ingested": "truth/ingested/"},
+)
+GALAXIES = Stage(
+    name="truth/galaxies",
+    build=lambda context, _: context.once(truth_of).galaxies,
+    reads=("truth/structure", "truth/ingested"),
+    units_known_after=("truth/ingested",),
+    unit="HEALPix cell",
+    summary="True galaxies, generated or from source catalogs: bulge, disk, knots, lensing, dust, spectra, fluxes in "
+    "all bands.",
+    sky=("ra", "dec"),
+    shrink_with="raise truth.order",
+    finish=_write_spectra,
+    tables={"galaxies": "truth/galaxies/"},
+)
+STARS = Stage(
+    name="truth/stars",
+    build=lambda context, _: context.once(truth_of).stars,
+    reads=("truth/ingested",),
+    units_known_after=("truth/ingested",),
+    unit="HEALPix cell",
+    summary="True stars: a Galactic model, or source catalogs.",
+    sky=("ra", "dec"),
+    shrink_with="raise truth.order",
+    tables={"stars": "truth/stars/"},
+)
+QUARANTINE = Stage(
+    name="truth/quarantine",
+    build=lambda context, _: context.once(truth_of).quarantine,
+    reads=("truth/ingested",),
+    units_known_after=("truth/ingested",),
+    unit="batch, then HEALPix cell",
+    summary="Rows of source catalogs that cannot be used, each with the reason.",
+    shrink_with="raise truth.order",
+    tables={"quarantine": "truth/quarantine/"},
+)
 
 
 def write_spectra(catalogs: TruthCatalogs, store: Store) -> None:

@@ -147,7 +147,7 @@ def test_exposures_have_what_was_read_and_its_calibration(later):
 
 def test_persistence_is_what_the_exposure_before_left(later):
     survey, row, earlier = later
-    product = survey.exposure_product("roman")
+    product = survey.output("exposures/roman")
     maker = product.make
     left = maker.trapped(earlier)
     # the same from the store and worked out again
@@ -170,7 +170,7 @@ def test_persistence_is_what_the_exposure_before_left(later):
 
 def test_every_effect_shows_by_itself(later):
     survey, row, _ = later
-    found = {one.effect: one.image for one in differences(survey.exposure_product("roman"), row)}
+    found = {one.effect: one.image for one in differences(survey.output("exposures/roman"), row)}
     assert list(found) == [
         "quantum efficiency",
         "count-rate nonlinearity",
@@ -200,7 +200,7 @@ def test_every_effect_shows_by_itself(later):
 
 def test_a_run_that_resumes_makes_the_same_and_draws_nothing_twice(full_store, later):
     survey, row, _ = later
-    names = survey.exposure_product("roman").names
+    names = survey.output("exposures/roman").names
     stage, store = "exposures/roman", survey.store
     first = read_record(store, stage, names[row])
     times = {name: store.record(stage, name).stat().st_mtime_ns for name in names}

@@ -28,7 +28,7 @@ from romandask.model.sky import Cone, Region, chord, unit_vectors
 from romandask.pipeline import pipeline_of
 from romandask.products.hats import WIDTH, margin, write_catalog_files
 from romandask.run import ingest
-from romandask.stage_graph import stages
+from romandask.stage_graph import stage_products
 from romandask.stages.truth.catalogs import truth
 from romandask.stages.truth.ingested import _ReadBatch
 from romandask.storage.store import Store
@@ -198,7 +198,7 @@ def test_a_source_is_read_once(tmp_path, shared, monkeypatch):
 
     monkeypatch.setattr(_ReadBatch, "__call__", counted)
     _, survey = ingested(tmp_path, shared, {"source": "skycatalogs", "path": "skycatalogs_sample"})
-    assert sorted(read) == list(range(len(survey.ingested_product.units)))
+    assert sorted(read) == list(range(len(survey.output("truth/ingested").units)))
 
 
 def ingested(tmp_path, shared, settings, seds="seds"):
@@ -213,7 +213,7 @@ def ingested(tmp_path, shared, settings, seds="seds"):
     }
     store = Store(tmp_path / "store")
     store.prepare()
-    counts = ingest(pipeline_of(content, "test"), store, InProcess(), Reporter(Console()))
+    counts = ingest(Survey(pipeline_of(content, "test"), store), InProcess(), Reporter(Console()))
     return counts, Survey(pipeline_of(content, "test"), store)
 
 
@@ -347,7 +347,7 @@ def test_stages_of_a_source_begin_with_its_rows(shared):
         "rubin": {},
         "truth": {"source": "skycatalogs", "path": "skycatalogs_sample"},
     }
-    names = [stage.name for stage in stages(Survey(pipeline_of(content, "test")))]
+    names = [one.name for one in stage_products(Survey(pipeline_of(content, "test")))]
     assert names[:5] == [
         "truth/ingested",
         "truth/galaxies",

@@ -16,7 +16,7 @@ from romandask.kernels.detectors.ccd import (
     read_out,
     segments,
 )
-from romandask.kernels.detectors.cosmic_rays import PIXEL, hits, tracks
+from romandask.kernels.detectors.cosmic_rays import PIXEL_SIZE, hits, tracks
 from romandask.model.seeds import rng
 
 SHAPE = (400, 320)
@@ -124,7 +124,7 @@ def test_the_calibrated_image_is_what_was_caught_with_its_variance():
 def test_muons_are_one_a_square_centimetre_and_minute():
     shape, seconds = (4000, 4072), 3000.0
     found = tracks(shape, seconds, rng(5, "rays"), **RAYS)
-    expected = shape[0] * shape[1] * (PIXEL * 1e-4) ** 2 * seconds / 60
+    expected = shape[0] * shape[1] * (PIXEL_SIZE * 1e-4) ** 2 * seconds / 60
     assert len(found) == pytest.approx(expected, abs=4 * np.sqrt(expected) + 0.03 * expected)
     # straight down through 100 micrometres: the most probable charge is 7500 electrons
     steep = found[np.hypot(found[:, 2], found[:, 3]) < 3]

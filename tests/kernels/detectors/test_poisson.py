@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from romandask.kernels.detectors.poisson import MOST, poisson
+from romandask.kernels.detectors.poisson import MAX_TABLE_MEAN, poisson
 
 
-@pytest.mark.parametrize("mean", [0.02, 0.7, 1.0, 7.25, 118.6, 1023.5, MOST - 0.1, MOST, 3e4])
+@pytest.mark.parametrize("mean", [0.02, 0.7, 1.0, 7.25, 118.6, 1023.5, MAX_TABLE_MEAN - 0.1, MAX_TABLE_MEAN, 3e4])
 def test_frequencies_are_those_of_the_distribution(mean):
     # its float32 is the mean that is drawn
     mean = float(np.float32(mean))
@@ -35,7 +35,7 @@ def test_tails_are_there():
 
 
 def test_each_pixel_has_its_own_mean_and_none_the_others():
-    mean = np.random.default_rng(3).uniform(0, 3 * MOST, (300, 700)).astype(np.float32)
+    mean = np.random.default_rng(3).uniform(0, 3 * MAX_TABLE_MEAN, (300, 700)).astype(np.float32)
     mean[:, :5] = 0
     found = poisson(mean, np.random.default_rng(4))
     pulls = (found - mean)[:, 5:] / np.sqrt(mean[:, 5:])

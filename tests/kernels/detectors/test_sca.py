@@ -8,7 +8,7 @@ import pytest
 from romandask.kernels.detectors import sca
 from romandask.kernels.detectors.brighter_fatter import brighter_fatter, potentials
 from romandask.kernels.detectors.cosmic_rays import hits, tracks
-from romandask.kernels.detectors.synthetic_sca import AREAS, area_kernels, capacitance
+from romandask.kernels.detectors.synthetic_sca import AREA_KERNEL_QUARTER, area_kernels, capacitance
 from romandask.model.seeds import rng
 
 
@@ -19,7 +19,7 @@ def generator(name):
 @pytest.fixture(scope="module")
 def kernel() -> np.ndarray:
     """One area kernel (5, 5), 1/electron."""
-    half = np.concatenate([AREAS, AREAS[:, 1::-1]], axis=1)
+    half = np.concatenate([AREA_KERNEL_QUARTER, AREA_KERNEL_QUARTER[:, 1::-1]], axis=1)
     return np.concatenate([half, half[1::-1]]) * 1e-6
 
 
@@ -77,7 +77,7 @@ def test_flat_fields_are_correlated_by_the_kernel(kernel):
                 found[dy, dx] += product.mean() / 2 / mean**2 / pairs
     # 1 / mean is Poisson's; the rest is the kernel's
     found[0, 0] -= 1 / mean
-    quarter = AREAS[::-1, ::-1] * 1e-6
+    quarter = AREA_KERNEL_QUARTER[::-1, ::-1] * 1e-6
     scatter = 1 / mean / np.sqrt(pairs * side**2)
     np.testing.assert_allclose(found[1:, 0], quarter[1:, 0], atol=5 * scatter)
     np.testing.assert_allclose(found[0, 1:], quarter[0, 1:], atol=5 * scatter)

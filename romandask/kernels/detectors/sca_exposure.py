@@ -51,8 +51,8 @@ JUMP_THRESHOLD = 50.0
 """Charge of a cosmic ray in a pixel above which it shows as a jump between the reads of an exposure, electrons: six
 times the read noise."""
 MIN_TRAPPED_CHARGE = 0.1
-"""Least trapped charge f(Q) that is followed, electrons. It adds at most twice as much to a later exposure, far below the
-noise of the sky."""
+"""Least trapped charge f(Q) that is followed, electrons. It adds at most twice as much to a later exposure, far below
+the noise of the sky."""
 _DQ_OF_BADPIX = (
     (DISCONNECTED, DISCONNECTED_FLAG),
     (HOT, HOT_FLAG),
@@ -72,7 +72,7 @@ Rows are those of the whole detector, reference pixels included. A calibration i
 enough for float64 calibrations. READ is the read noise of an exposure alone, electrons.
 """
 Generators = Callable[[str, int], np.random.Generator]
-"""Returns the random generator of a block of rows in one step, given the name of the step and the number of the block."""
+"""Returns the random generator of a block of rows in one step, given the name of the step and the block's number."""
 
 
 @dataclass(frozen=True)

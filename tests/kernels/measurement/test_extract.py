@@ -16,7 +16,7 @@ from romandask.kernels.measurement import psf_fit
 from romandask.kernels.measurement.extract import (
     FLAGS,
     NOT_DEBLENDED,
-    Found,
+    DetectedObjects,
     detect,
     ellipse_flux,
     kron_fluxes,
@@ -137,8 +137,8 @@ def test_quoted_errors_are_the_scatter_on_correlated_noise():
         ones, nowhere = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)
         flux, error, _ = ellipse_flux(layer, nowhere, ones.astype(int), x, y, ones, ones, 0 * ones, radius * ones)
         assert np.std(flux / error) == pytest.approx(1, abs=0.1)
-    unused = {name: np.zeros(len(x)) for name in Found.__dataclass_fields__ if name not in ("x", "y")}
-    flux, error = psf_fluxes(layer, Found(x=x, y=y, **unused))
+    unused = {name: np.zeros(len(x)) for name in DetectedObjects.__dataclass_fields__ if name not in ("x", "y")}
+    flux, error = psf_fluxes(layer, DetectedObjects(x=x, y=y, **unused))
     assert np.std(flux / error) == pytest.approx(1, abs=0.1)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from romandask.kernels.measurement.extract import detect_peaks
 from romandask.kernels.measurement.measurement_image import MeasurementImage
-from romandask.kernels.measurement.peaks import KERNEL, find_peaks, point_source_snr
+from romandask.kernels.measurement.peaks import KERNEL_HALF_WIDTH, find_peaks, point_source_snr
 from romandask.model.seeds import rng
 
 PSF = galsim.Convolve(galsim.Kolmogorov(fwhm=3.5), galsim.Pixel(1.0)).drawImage(
@@ -31,7 +31,7 @@ def stars(shape, places, fluxes) -> np.ndarray:
 def noise_of_a_point() -> float:
     """Return the error of the flux of a point source that is fitted with the PSF."""
     middle = PSF.array.shape[0] // 2
-    part = slice(middle - KERNEL, middle + KERNEL + 1)
+    part = slice(middle - KERNEL_HALF_WIDTH, middle + KERNEL_HALF_WIDTH + 1)
     return RMS / np.sqrt((PSF.array[part, part].astype(float) ** 2).sum())
 
 

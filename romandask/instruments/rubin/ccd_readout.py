@@ -11,7 +11,7 @@ from romandask.instruments.rubin.rubin import Rubin
 from romandask.kernels.detectors.ccd import (
     CCD_FLAGS,
     COSMIC_RAY,
-    FOUND,
+    COSMIC_RAY_THRESHOLD,
     RAYS,
     ROWS,
     Amplifiers,
@@ -62,7 +62,7 @@ class CcdReadout:
         if self.instrument.settings.cosmic_rays:
             rays = hits(charge.shape, tracks(charge.shape, exposure.exptime, self.random(exposure, "rays"), **RAYS))
             charge += rays
-            dq[rays > FOUND] = COSMIC_RAY
+            dq[rays > COSMIC_RAY_THRESHOLD] = COSMIC_RAY
             del rays
         chips = self.amplifiers(exposure.detector)
         charge, full = bleed(charge, chips)

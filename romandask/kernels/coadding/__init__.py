@@ -1,1 +1,1 @@
-"""Resampling exposures onto tiles."""
+"""Resampling of exposures onto tiles."""

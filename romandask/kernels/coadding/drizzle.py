@@ -1,9 +1,10 @@
-"""Drizzling exposures, one at a time, onto a tile: the square kernel, all planes of an exposure in one pass.
+"""Drizzling of exposures onto a tile with the square kernel, all planes of an exposure in one pass.
 
-Every pixel of an exposure, shrunk by pixfrac, is a quadrilateral on the tile and gives each tile pixel its light in
-proportion to the exact area of their overlap (Fruchter & Hook 2002). Areas are those that font rasterisers find: each
-side adds to the cells that it crosses the signed area between itself and their right edges, and to the next cell the
-rest of its height; sums along a row are then the covered shares.
+A pixel of an exposure, shrunk by pixfrac (a drop), is a quadrilateral on the tile. It adds its light to each tile pixel
+in proportion to the exact area of their overlap (Fruchter & Hook 2002). Areas are computed as in font rasterisers: each
+edge of the quadrilateral adds to each cell that it crosses the signed area between the edge and the right side of the
+cell, and to the next cell the rest of the height that it spans. The cumulative sum along a row of cells is then the
+covered share of each cell.
 """
 
 from __future__ import annotations
@@ -15,39 +16,60 @@ import numpy as np
 
 from romandask.kernels.coadding.pixel_map import PixelMap
 
-MOST_SETS = 65_535
-"""Different sets of exposures on one tile."""
-_LEAST = 1e-9
-"""Share of a tile pixel below which an overlap is rounding."""
+MAX_SETS = 65_535
+"""Largest number of different sets of exposures on one tile."""
+_MIN_OVERLAP = 1e-9
+"""Share of a tile pixel below which an overlap is rounding error."""
 
 
 class Sums:
-    """The running weighted sums of the exposures of a tile, and which exposures each of its pixels has.
+    """Running weighted sums over the exposures of a tile, and the set of exposures that contribute to each pixel.
 
-    All planes of an exposure share map and weight. Sets are numbered in the order in which they first appear, from 0,
-    that of no exposure.
+    All planes of an exposure share one pixel map and one weight. Sets of exposures are numbered in the order in which
+    they first appear; number 0 is the empty set.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the tile.
+    planes : int
+        Number of planes of each exposure.
+    pixfrac : float
+        Side of a drop over the side of a native pixel.
     """
 
     def __init__(self, shape: tuple[int, int], planes: int, pixfrac: float):
         self._sums = tuple(np.zeros(shape, np.float32) for _ in range(planes))
         self._pixfrac = pixfrac
-        self._links: list[tuple[int, int]] = [(0, -1)]
-        self._exposures = 0
+        self._set_links: list[tuple[int, int]] = [(0, -1)]  # of each set: parent set, exposure added to it
+        self._exposure_count = 0
         self.weight = np.zeros(shape, np.float32)
-        """Sum of weights, (ny, nx)."""
+        """Sum of the weights, (ny, nx)."""
         self.set = np.zeros(shape, np.uint16)
-        """Number of the set of exposures that contribute to each pixel."""
+        """Number of the set of exposures that contribute to each pixel, (ny, nx)."""
 
     def add(self, parts: Iterable[tuple[Sequence[np.ndarray], np.ndarray, PixelMap]]) -> None:
-        """Add one exposure in parts of (images in surface brightness, weight, map); weight 0 where a pixel is bad."""
-        first = len(self._links)
-        follow = np.full(first, -1, np.int32)
-        parents = np.zeros(MOST_SETS + 1 - first, np.int32)
-        count = 0
+        """Add one exposure.
+
+        Parameters
+        ----------
+        parts : iterable of (images, weight, map)
+            One entry for each strip of the exposure: its planes in surface brightness, each (ny, nx); its weight
+            (ny, nx), 0 for bad pixels; the map of its pixels onto the tile.
+
+        Raises
+        ------
+        ValueError
+            If the tile would have more than MAX_SETS different sets of exposures.
+        """
+        old_sets = len(self._set_links)
+        successor = np.full(old_sets, -1, np.int32)
+        parents = np.zeros(MAX_SETS + 1 - old_sets, np.int32)
+        new_sets = 0
         for images, weight, pixel_map in parts:
             rows = np.arange(pixel_map.rows.start, pixel_map.rows.stop, dtype=float)
             half = self._pixfrac / 2
-            count = _drizzle(
+            new_sets = _drizzle(
                 tuple(np.ascontiguousarray(image, np.float32) for image in images),
                 np.ascontiguousarray(weight, np.float32),
                 pixel_map.curves(rows - half),
@@ -58,22 +80,22 @@ class Sums:
                 self._sums,
                 self.weight,
                 self.set,
-                follow,
+                successor,
                 parents,
-                count,
+                new_sets,
             )
-            if count < 0:
-                raise ValueError(f"more than {MOST_SETS} different sets of exposures on one tile: make tiles smaller")
-        self._links += [(int(parent), self._exposures) for parent in parents[:count]]
-        self._exposures += 1
+            if new_sets < 0:
+                raise ValueError(f"more than {MAX_SETS} different sets of exposures on one tile: make tiles smaller")
+        self._set_links += [(int(parent), self._exposure_count) for parent in parents[:new_sets]]
+        self._exposure_count += 1
 
     @property
     def sets(self) -> list[tuple[int, ...]]:
-        """The exposures of each set, as numbers in the order in which they were added."""
-        found: list[tuple[int, ...]] = [()]
-        for parent, exposure in self._links[1:]:
-            found.append((*found[parent], exposure))
-        return found
+        """Exposures of each set, as numbers from 0 in the order in which they were added."""
+        members: list[tuple[int, ...]] = [()]
+        for parent, exposure in self._set_links[1:]:
+            members.append((*members[parent], exposure))
+        return members
 
     @property
     def count(self) -> np.ndarray:
@@ -81,9 +103,9 @@ class Sums:
         return np.array([len(members) for members in self.sets], np.uint16)[self.set]
 
     def means(self) -> list[np.ndarray]:
-        """Return the weighted means of the planes, 0 where nothing falls.
+        """Return the weighted means of the planes, each (ny, nx), 0 where the weight is 0.
 
-        They are in the place of the sums: nothing can be added any more.
+        The means overwrite the sums: no exposure can be added afterwards.
         """
         for plane in self._sums:
             np.divide(plane, self.weight, out=plane, where=self.weight > 0)
@@ -91,30 +113,45 @@ class Sums:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets, follow, parents, count):
-    """Add the pixels of a part of an exposure; return how many sets are new by now, -1 where they are too many.
+def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, total, sets, successor, parents, new_sets):
+    """Add a strip of an exposure to the sums; return the number of new sets, -1 if there are too many.
 
-    `lower` and `upper` are the curves of the lower and upper sides of each row's pixels.
+    Parameters
+    ----------
+    images, weight : tuple of (ny, nx), and (ny, nx)
+        Planes and weight of the strip.
+    lower, upper : (ny, 2, pieces, 4)
+        Cubics (`PixelMap.curves`) of the lower and the upper edges of the drops of each row.
+    knots, first_column : (pieces + 1,), int
+        Columns of the exposure at which the cubics join, and the first column of the strip.
+    half : float
+        Half the side of a drop, native pixels.
+    sums, total, sets : tuple of (height, width), and (height, width)
+        Sums of the planes, sum of the weights and number of the set of each tile pixel. They are updated.
+    successor : (old sets,)
+        Number of the set that each old set becomes with this exposure, -1 for none yet. It is updated.
+    parents, new_sets : (room,), int
+        Old set from which each new set was made, and the number of new sets so far.
     """
     ny, nx = weight.shape
     height, width = total.shape
     step = knots[1] - knots[0]
-    most = _window(lower, upper, step)
-    cells = np.zeros((most, most + 2))
-    # column after column of pieces of rows: what one falls on the next falls on too, and it is still in cache
+    extent = _max_extent(lower, upper, step)
+    cells = np.zeros((extent, extent + 2))
+    # pieces of rows in the outer loop: neighbouring rows then fall on the same tile pixels while these are in cache
     for piece in range(len(knots) - 1):
-        begin = max(int(np.ceil(knots[piece])) - first, 0)
-        end = nx if piece == len(knots) - 2 else min(int(np.ceil(knots[piece + 1])) - first, nx)
+        begin = max(int(np.ceil(knots[piece])) - first_column, 0)
+        end = nx if piece == len(knots) - 2 else min(int(np.ceil(knots[piece + 1])) - first_column, nx)
         for row in range(ny):
             low, high = lower[row, :, piece], upper[row, :, piece]
-            if _beyond(low, high, step, most, height, width):
+            if _is_outside(low, high, step, extent, height, width):
                 continue
             for column in range(begin, end):
                 w = weight[row, column]
                 if w <= 0:
                     continue
-                near, far = column + first - knots[piece] - half, column + first - knots[piece] + half
-                # pixel k of the tile is from k to k + 1 here
+                near, far = column + first_column - knots[piece] - half, column + first_column - knots[piece] + half
+                # shifted by half a pixel: tile pixel k spans k to k + 1
                 ax, ay = _cubic(low[0], near) + 0.5, _cubic(low[1], near) + 0.5
                 bx, by = _cubic(low[0], far) + 0.5, _cubic(low[1], far) + 0.5
                 cx, cy = _cubic(high[0], far) + 0.5, _cubic(high[1], far) + 0.5
@@ -123,11 +160,11 @@ def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets
                 bottom, top = np.floor(min(ay, by, cy, dy)), np.floor(max(ay, by, cy, dy))
                 if right < 0 or left >= width or top < 0 or bottom >= height:
                     continue
-                given = np.float32(w / abs(0.5 * ((cx - ax) * (dy - by) - (dx - bx) * (cy - ay))))
-                _side(cells, ax - left, ay - bottom, bx - left, by - bottom)
-                _side(cells, bx - left, by - bottom, cx - left, cy - bottom)
-                _side(cells, cx - left, cy - bottom, dx - left, dy - bottom)
-                _side(cells, dx - left, dy - bottom, ax - left, ay - bottom)
+                weight_per_area = np.float32(w / abs(0.5 * ((cx - ax) * (dy - by) - (dx - bx) * (cy - ay))))
+                _add_edge(cells, ax - left, ay - bottom, bx - left, by - bottom)
+                _add_edge(cells, bx - left, by - bottom, cx - left, cy - bottom)
+                _add_edge(cells, cx - left, cy - bottom, dx - left, dy - bottom)
+                _add_edge(cells, dx - left, dy - bottom, ax - left, ay - bottom)
                 x0, y0, columns = int(left), int(bottom), int(right - left) + 1
                 for j in range(int(top - bottom) + 1):
                     covered = 0.0
@@ -137,24 +174,24 @@ def _drizzle(images, weight, lower, upper, knots, first, half, sums, total, sets
                         cells[j, i] = 0
                         share = abs(covered)
                         x = x0 + i
-                        if share < _LEAST or y < 0 or y >= height or x < 0 or x >= width:
+                        if share < _MIN_OVERLAP or y < 0 or y >= height or x < 0 or x >= width:
                             continue
-                        part = given * np.float32(share)
-                        total[y, x] += part
+                        pixel_weight = weight_per_area * np.float32(share)
+                        total[y, x] += pixel_weight
                         for plane in range(len(images)):
-                            sums[plane][y, x] += part * images[plane][row, column]
+                            sums[plane][y, x] += pixel_weight * images[plane][row, column]
                         old = sets[y, x]
-                        if old < len(follow):
-                            if follow[old] < 0:
-                                if count >= len(parents):
+                        if old < len(successor):
+                            if successor[old] < 0:
+                                if new_sets >= len(parents):
                                     return -1
-                                follow[old] = len(follow) + count
-                                parents[count] = old
-                                count += 1
-                            sets[y, x] = follow[old]
+                                successor[old] = len(successor) + new_sets
+                                parents[new_sets] = old
+                                new_sets += 1
+                            sets[y, x] = successor[old]
                     cells[j, columns] = 0
                     cells[j, columns + 1] = 0
-    return count
+    return new_sets
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -163,21 +200,21 @@ def _cubic(c, t):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _window(lower, upper, step):
-    """Return the most tile pixels along one axis that a source pixel may touch: its width and height, and a rest."""
-    most = 0.0
+def _max_extent(lower, upper, step):
+    """Return an upper limit, with a margin, of the tile pixels that a drop touches along one axis."""
+    largest = 0.0
     for row in range(len(lower)):
         for axis in range(2):
             for piece in range(lower.shape[2]):
                 c = lower[row, axis, piece]
                 along = abs(_cubic(c, step) - _cubic(c, 0.0)) / step
-                most = max(most, along + abs(upper[row, axis, piece, 3] - c[3]))
-    return int(1.1 * most) + 3
+                largest = max(largest, along + abs(upper[row, axis, piece, 3] - c[3]))
+    return int(1.1 * largest) + 3
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _beyond(low, high, step, margin, height, width):
-    """Return whether a piece of a row, as good as straight, lies outside the tile."""
+def _is_outside(low, high, step, margin, height, width):
+    """Return whether a piece of a row lies outside the tile; the piece is nearly straight."""
     for axis in range(2):
         length = width if axis == 0 else height
         a, b = _cubic(low[axis], 0.0), _cubic(low[axis], step)
@@ -187,8 +224,8 @@ def _beyond(low, high, step, margin, height, width):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _side(cells, x0, y0, x1, y1):
-    """Add a side of a quadrilateral to the cells: signed areas, of which sums along a row are covered shares."""
+def _add_edge(cells, x0, y0, x1, y1):
+    """Add the signed areas of an edge of a quadrilateral to the cells; see the module docstring."""
     if y0 == y1:
         return
     sign = 1.0
@@ -198,26 +235,26 @@ def _side(cells, x0, y0, x1, y1):
     x, y, j = x0, y0, int(y0)
     while y < y1:
         top = min(j + 1.0, y1)
-        beyond = x1 if top == y1 else x + slope * (top - y)
-        a, b = min(x, beyond), max(x, beyond)
-        tall = sign * (top - y)
+        x_top = x1 if top == y1 else x + slope * (top - y)
+        a, b = min(x, x_top), max(x, x_top)
+        signed_height = sign * (top - y)
         first, last = int(a), int(b)
         if first == last:
             middle = 0.5 * (a + b) - first
-            cells[j, first] += tall * (1 - middle)
-            cells[j, first + 1] += tall * middle
+            cells[j, first] += signed_height * (1 - middle)
+            cells[j, first + 1] += signed_height * middle
         else:
-            per = 1 / (b - a)
+            inverse_width = 1 / (b - a)
             start, stop = 1 - (a - first), b - last
-            head, tail = 0.5 * per * start * start, 0.5 * per * stop * stop
-            cells[j, first] += tall * head
+            head, tail = 0.5 * inverse_width * start * start, 0.5 * inverse_width * stop * stop
+            cells[j, first] += signed_height * head
             if last == first + 1:
-                cells[j, last] += tall * (1 - head - tail)
+                cells[j, last] += signed_height * (1 - head - tail)
             else:
-                so_far = per * (start + 0.5)
-                cells[j, first + 1] += tall * (so_far - head)
+                so_far = inverse_width * (start + 0.5)
+                cells[j, first + 1] += signed_height * (so_far - head)
                 for k in range(first + 2, last):
-                    cells[j, k] += tall * per
-                cells[j, last] += tall * (1 - so_far - (last - first - 2) * per - tail)
-            cells[j, last + 1] += tall * tail
-        x, y, j = beyond, top, j + 1
+                    cells[j, k] += signed_height * inverse_width
+                cells[j, last] += signed_height * (1 - so_far - (last - first - 2) * inverse_width - tail)
+            cells[j, last + 1] += signed_height * tail
+        x, y, j = x_top, top, j + 1

@@ -1,4 +1,4 @@
-"""Numbers of a stack of exposures that is not resampled: coverage, inverse variance, source noise."""
+"""Coverage, inverse variance and source noise of a stack of exposures, from their footprints alone."""
 
 from __future__ import annotations
 
@@ -12,23 +12,30 @@ class Stack:
     """Sums over the exposures that cover each pixel of a tile."""
 
     count: np.ndarray
-    """(ny, nx) uint16, exposures."""
+    """Number of exposures, (ny, nx) uint16."""
     weight: np.ndarray
-    """(ny, nx) float32, sum of inverse variances of an empty pixel, 1/flux^2."""
+    """Sum of the inverse variances of an empty pixel, (ny, nx) float32, 1/flux^2."""
     source: np.ndarray
-    """(ny, nx) float32: variance (flux^2) of the weighted mean for a unit flux of the objects."""
+    """Poisson variance of the weighted mean per unit flux of the sources, (ny, nx) float32: variance (flux^2) over
+    flux."""
     shares: np.ndarray
-    """(exposures,) weight of each exposure, summed over the tile."""
+    """Weight of each exposure, summed over the tile, (exposures,)."""
 
 
 def stack(polygons: np.ndarray, variances: np.ndarray, gains: np.ndarray, shape: tuple[int, int]) -> Stack:
-    """Return the sums of exposures with inverse-variance weights.
+    """Return the sums over exposures with inverse-variance weights.
 
     Parameters
     ----------
-    polygons : (n, k, 2) footprints in pixels of the tile, convex, in order; x and y, 0 at the first pixel's centre
-    variances : (n,) variance of an empty pixel, flux^2
-    gains : (n,) electrons per unit flux, of each exposure
+    polygons : ndarray, shape (n, k, 2), tile pixels
+        Corners (x, y) of the convex footprints of the exposures, in order along the outline; 0 is the centre of the
+        first pixel.
+    variances : ndarray, shape (n,), flux^2
+        Variance of an empty pixel in each exposure.
+    gains : ndarray, shape (n,), electrons per unit flux
+        Gain of each exposure.
+    shape : tuple of int
+        Rows and columns of the tile.
     """
     count = np.zeros(shape, np.uint16)
     weight = np.zeros(shape, np.float32)
@@ -39,8 +46,9 @@ def stack(polygons: np.ndarray, variances: np.ndarray, gains: np.ndarray, shape:
         inside = np.ones(shape, bool)
         centre = polygon.mean(axis=0)
         for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-            side = np.sign((x1 - x0) * (centre[1] - y0) - (y1 - y0) * (centre[0] - x0))
-            inside &= side * ((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)) >= 0
+            # sign of the half plane, bounded by this edge, that holds the centre
+            sign = np.sign((x1 - x0) * (centre[1] - y0) - (y1 - y0) * (centre[0] - x0))
+            inside &= sign * ((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)) >= 0
         count += inside
         weight += inside * np.float32(1 / variance)
         source += inside * np.float32(1 / (variance**2 * gain))

@@ -1,1 +1,1 @@
-"""From expected light to what a detector reads, and back."""
+"""Detector effects and their calibration: from expected light to data numbers, and back to electrons."""

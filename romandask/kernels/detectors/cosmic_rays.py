@@ -6,17 +6,18 @@ import numba
 import numpy as np
 
 RATE = 5.5
-"""Particles a cm2 and second at L2, secondary ones included."""
-PIXEL = 10.0
-"""Micrometres."""
+"""Particles per cm2 and second at L2, secondary particles included."""
+PIXEL_SIZE = 10.0
+"""Side of a pixel, micrometres."""
 DEPTH = 5.0
-"""Micrometres of the layer in which charge is made."""
+"""Thickness of the layer in which charge is made, micrometres."""
 CHARGE = 500.0
-"""Electrons a micrometre, the most probable: 1 keV (minimum ionising, 7.6 g/cm3) at 2 eV an electron."""
-SPREAD = 0.15
-"""Width of Moyal's distribution of the charge a micrometre, over the most probable: its tail is Landau's."""
-LONGEST = 100.0
-"""Depths: a longer path, all but along the layer, ends where its particle stops."""
+"""Most probable charge, electrons per micrometre: 1 keV (minimum ionising, 7.6 g/cm3) at 2 eV per electron."""
+MOYAL_WIDTH = 0.15
+"""Width of the Moyal distribution of the charge per micrometre, over the most probable charge. It has the tail of a
+Landau distribution."""
+MAX_PATH = 100.0
+"""Longest path, in units of the depth: a longer path, nearly parallel to the layer, ends where the particle stops."""
 
 
 def tracks(
@@ -27,39 +28,68 @@ def tracks(
     depth: float = DEPTH,
     charge: float = CHARGE,
 ) -> np.ndarray:
-    """Return the tracks (n, 5) of an exposure: x, y (pixels), length in x and in y (pixels), charge (electrons).
+    """Draw the cosmic-ray tracks of an exposure.
 
-    Rate, depth and charge a micrometre are, if not given, those of Roman's SCAs.
+    Directions are isotropic, so the flux through the surface of the layer is proportional to the cosine of the angle of
+    incidence. The defaults of rate, depth and charge are those of Roman's SCAs.
 
-    Particles come from all sides alike, so that through the layer's surface they come with the cosine of their angle.
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the detector.
+    exptime : float, seconds
+    rng : Generator
+    rate : float, 1/cm2/s
+        Rate of particles.
+    depth : float, micrometres
+        Thickness of the layer in which charge is made.
+    charge : float, electrons per micrometre
+        Most probable charge.
+
+    Returns
+    -------
+    ndarray, shape (n, 5)
+        For each track: x and y of its start (pixels), its length in x and in y (pixels), its charge (electrons).
     """
-    area = shape[0] * shape[1] * (PIXEL * 1e-4) ** 2
+    area = shape[0] * shape[1] * (PIXEL_SIZE * 1e-4) ** 2
     n = rng.poisson(rate * area * exptime)
-    # the flux through a surface goes as cos, so cos^2 is uniform
+    # the flux is proportional to the cosine, so the square of the cosine is uniform
     cosine = np.sqrt(rng.uniform(0, 1, n))
-    path = np.minimum(depth / np.maximum(cosine, 1e-9), depth * LONGEST)
-    across = path * np.sqrt(1 - cosine**2) / PIXEL
+    path = np.minimum(depth / np.maximum(cosine, 1e-9), depth * MAX_PATH)
+    across = path * np.sqrt(1 - cosine**2) / PIXEL_SIZE
     angle = rng.uniform(0, 2 * np.pi, n)
     normal = rng.standard_normal(n)
-    # Moyal: minus the logarithm of the square of a normal number
-    loss = charge * (1 + SPREAD * -np.log(np.maximum(normal**2, 1e-12)))
+    # a Moyal variate is minus the logarithm of the square of a normal variate
+    loss = charge * (1 + MOYAL_WIDTH * -np.log(np.maximum(normal**2, 1e-12)))
     x, y = rng.uniform(-0.5, shape[1] - 0.5, n), rng.uniform(-0.5, shape[0] - 0.5, n)
     return np.stack([x, y, across * np.cos(angle), across * np.sin(angle), np.maximum(loss, 0) * path], axis=1)
 
 
-def hits(shape: tuple[int, int], found: np.ndarray) -> np.ndarray:
-    """Return the charge (float32, electrons) that tracks leave in pixels; what falls beyond the edge is lost."""
+def hits(shape: tuple[int, int], tracks: np.ndarray) -> np.ndarray:
+    """Return the charge that tracks leave in the pixels of a detector; charge beyond its edges is lost.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the detector.
+    tracks : ndarray, shape (n, 5)
+        As `tracks` returns them.
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), float32, electrons
+    """
     image = np.zeros(shape, np.float32)
-    _draw(image, found)
+    _draw(image, tracks)
     return image
 
 
 @numba.njit(nogil=True, cache=True)
-def _draw(image, found):
+def _draw(image, tracks):
     ny, nx = image.shape
-    for n in range(found.shape[0]):
-        x, y, dx, dy, charge = found[n]
-        # steps of an eighth of a pixel
+    for n in range(tracks.shape[0]):
+        x, y, dx, dy, charge = tracks[n]
+        # divide the charge over steps of an eighth of a pixel
         steps = int(8 * np.hypot(dx, dy)) + 1
         for k in range(steps):
             share = (k + 0.5) / steps

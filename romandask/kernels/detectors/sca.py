@@ -1,8 +1,9 @@
-"""Effects of Roman's detectors (SCAs), one function each: values in, values out, on a whole array or on some rows.
+"""Effects of Roman's detectors (SCAs), one function each, on a whole array or on some of its rows.
 
 The order is that of Troxel et al. 2023, section 4.4: light (quantum efficiency, count-rate nonlinearity), the
 brighter-fatter effect, persistence, dark current, saturation, classical nonlinearity, interpixel capacitance, bad
-pixels, read noise, gain, bias, whole numbers.
+pixels, read noise, gain, bias, rounding to whole data numbers. Names in capitals (RELQE1) are the calibrations of the
+paper's table 1.
 """
 
 from __future__ import annotations
@@ -11,24 +12,39 @@ import numba
 import numpy as np
 
 STIMULI = np.array([1e3, 3e3, 1e4, 3e4, 1e5, 3e5])
-"""Electrons at which persistence is measured, by plane of PERSIST."""
+"""Charges at which persistence is measured, one for each plane of PERSIST, electrons."""
 MEMORY = 10.0
-"""Exposure times for which persistence is followed."""
-RATE = 100.0
-"""Electrons a second at which count-rate nonlinearity is defined to do nothing."""
+"""Time for which persistence is followed, in units of the exposure time."""
+REFERENCE_RATE = 100.0
+"""Count rate at which count-rate nonlinearity has no effect by definition, electrons per second."""
 LARGEST_DN = 65535
-"""Of the data numbers that a detector returns."""
+"""Largest data number that a detector returns."""
 
 
 def expand(blocks: np.ndarray, block: int, rows: slice, columns: slice = slice(None)) -> np.ndarray:
-    """Return values of blocks (..., ny, nx) at the pixels of some rows and columns.
+    """Return the values of blocks of pixels at the pixels of some rows and columns.
 
+    Parameters
+    ----------
+    blocks : ndarray, shape (..., blocks y, blocks x)
+    block : int
+        Pixels along a side of a block.
+    rows, columns : slice
+        Pixels of the whole detector.
+
+    Returns
+    -------
+    ndarray, shape (..., rows, columns)
+        A read-only view if all rows lie in one block.
+
+    Examples
+    --------
     >>> expand(np.array([[1, 2]]), 2, slice(0, 1))
     array([[1, 1, 2, 2]])
     """
     ny, nx = (length * block for length in blocks.shape[-2:])
     first, last, _ = rows.indices(ny)
-    # the rows of a block are one row, seen as many times as it is asked for
+    # rows of one block are equal: broadcast one row instead of copying it
     wide = np.repeat(blocks[..., first // block : -(-last // block), :], block, axis=-1)[..., columns]
     if wide.shape[-2] == 1:
         return np.broadcast_to(wide, (*wide.shape[:-2], last - first, wide.shape[-1]))
@@ -36,37 +52,55 @@ def expand(blocks: np.ndarray, block: int, rows: slice, columns: slice = slice(N
 
 
 def quantum_efficiency(light: np.ndarray, white: np.ndarray, coloured: np.ndarray) -> np.ndarray:
-    """Return expected electrons from those of a detector of nominal efficiency.
+    """Apply the relative quantum efficiency to expected electrons at nominal efficiency.
 
     Parameters
     ----------
-    light : (ny, nx) electrons
-    white : (ny, nx) relative efficiency of each pixel (RELQE1)
-    coloured : (ny, nx) or scalar, the blocks' (RELQE2), averaged over the band
+    light : ndarray, shape (ny, nx), electrons
+    white : ndarray, shape (ny, nx)
+        Relative efficiency of each pixel (RELQE1).
+    coloured : ndarray, shape (ny, nx), or float
+        Relative efficiency of the blocks of pixels, averaged over the band (RELQE2).
     """
     return light * white * coloured
 
 
-def band_mean(planes: np.ndarray, wave: np.ndarray, at: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean (...) over a band of planes (waves, ...) known at some wavelengths, nm.
+def band_mean(planes: np.ndarray, wave: np.ndarray, band_wave: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the mean over a band of planes that are known at some wavelengths.
 
     Parameters
     ----------
-    wave : (waves,) ascending; beyond its ends the first and last planes hold
-    at, weights : (n,) wavelengths of the band and the photons at each
+    planes : ndarray, shape (waves, ...)
+    wave : ndarray, shape (waves,), nm
+        Wavelengths of the planes, ascending. Beyond its ends the first and the last plane are used.
+    band_wave : ndarray, shape (n,), nm
+        Wavelengths of the band.
+    weights : ndarray, shape (n,)
+        Photons at each wavelength of the band.
+
+    Returns
+    -------
+    ndarray, shape (...)
     """
-    place = np.interp(at, wave, np.arange(len(wave)))
-    shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(wave))), 0, 1)
+    position = np.interp(band_wave, wave, np.arange(len(wave)))
+    shares = np.clip(1 - np.abs(position[:, None] - np.arange(len(wave))), 0, 1)
     return np.tensordot((weights / np.sum(weights)) @ shares, planes, 1)
 
 
 def quantum_yield(photons: np.ndarray, mean: np.ndarray | float, rng: np.random.Generator) -> np.ndarray:
-    """Return electrons of photons that were caught: each makes one, and a second with a chance of mean - 1.
+    """Return the electrons of detected photons: each makes one, and a second one with a probability of `mean` - 1.
 
     Parameters
     ----------
-    photons : (ny, nx) whole numbers
-    mean : electrons a photon, 1 to 2 (QYIELD); shorter than about 0.8 micrometres it exceeds 1
+    photons : ndarray, shape (ny, nx), whole numbers
+    mean : ndarray, shape (ny, nx), or float
+        Mean electrons per photon, 1 to 2 (QYIELD); it exceeds 1 at wavelengths below about 0.8 micrometres.
+    rng : Generator
+
+    Returns
+    -------
+    ndarray, shape (ny, nx)
+        `photons` itself if no mean exceeds 1.
     """
     if np.all(np.asarray(mean) <= 1):
         return photons
@@ -74,31 +108,45 @@ def quantum_yield(photons: np.ndarray, mean: np.ndarray | float, rng: np.random.
 
 
 def count_rate_nonlinearity(electrons: np.ndarray, exponent: np.ndarray | float, exptime: float) -> np.ndarray:
-    """Return expected electrons as a detector collects them whose efficiency depends on the rate.
+    """Apply count-rate nonlinearity to expected electrons.
 
-    A rate r, e/s, is counted as r (r / RATE)^exponent (CRNL; de Jong et al. 2006).
+    A rate r is counted as r (r / REFERENCE_RATE)^exponent (de Jong et al. 2006).
+
+    Parameters
+    ----------
+    electrons : ndarray, electrons
+    exponent : ndarray or float
+        Exponent of the count rate (CRNL).
+    exptime : float, seconds
     """
-    relative = np.maximum(electrons / (exptime * RATE), np.float32(1e-6))
+    relative = np.maximum(electrons / (exptime * REFERENCE_RATE), np.float32(1e-6))
     return electrons * np.exp(exponent * np.log(relative))
 
 
 def count_rate_linearity(electrons: np.ndarray, exponent: np.ndarray | float, exptime: float) -> np.ndarray:
-    """Return what `count_rate_nonlinearity` was given."""
-    relative = np.maximum(electrons / (exptime * RATE), np.float32(1e-6))
+    """Undo `count_rate_nonlinearity`; the parameters are the same."""
+    relative = np.maximum(electrons / (exptime * REFERENCE_RATE), np.float32(1e-6))
     return electrons * np.exp(-exponent / (1 + np.asarray(exponent)) * np.log(relative))
 
 
 def persistence(charge: np.ndarray, planes: np.ndarray, age: float) -> np.ndarray:
-    """Return the current, e/s, that a pixel gives off after an exposure.
+    """Return the persistence current of pixels after an exposure.
+
+    The current is f(Q) / age. f is linear between the six charges STIMULI, proportional to the charge below the first,
+    and the power law through the last two above the last.
 
     Parameters
     ----------
-    charge : (...,) electrons that the exposure left in pixels
-    planes : (6, ...) electrons, f(Q) at the charges STIMULI (PERSIST)
-    age : seconds since the exposure ended
+    charge : ndarray, shape (...), electrons
+        Charge Q that the exposure collected.
+    planes : ndarray, shape (6, ...), electrons
+        f(Q) at the charges STIMULI (PERSIST).
+    age : float, seconds
+        Time since the exposure ended.
 
-    The current is f(Q) / age. Between the six charges f is linear, below the first it is proportional to the charge,
-    above the last it is the power law through the last two.
+    Returns
+    -------
+    ndarray, shape (...), electrons per second
     """
     charge = np.maximum(charge, 0)
     released = charge / STIMULI[0] * planes[0]
@@ -114,17 +162,31 @@ def persistence(charge: np.ndarray, planes: np.ndarray, age: float) -> np.ndarra
 
 
 def saturate(charge: np.ndarray, well: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return charge clipped at the full well (SATURATE), electrons, and where it was clipped."""
+    """Clip charge at the full well (SATURATE), electrons; return it and a mask of the pixels at the full well."""
     return np.minimum(charge, well), charge >= well
 
 
 def nonlinear(charge: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Return the signal, electrons, of a charge Q: Q - b2 Q^2 - b3 Q^3 - b4 Q^4 (CNL: planes b2, b3, b4)."""
+    """Apply classical nonlinearity to a charge Q: return Q - b2 Q^2 - b3 Q^3 - b4 Q^4.
+
+    Parameters
+    ----------
+    charge : ndarray, shape (...), electrons
+    planes : ndarray, shape (3, ...)
+        Coefficients b2, b3, b4 (CNL), 1/electron, 1/electron^2, 1/electron^3.
+
+    Returns
+    -------
+    ndarray, shape (...), electrons
+    """
     return charge * (1 - charge * (planes[0] + charge * (planes[1] + charge * planes[2])))
 
 
 def linear(signal: np.ndarray, planes: np.ndarray, steps: int = 4) -> np.ndarray:
-    """Return the charge whose signal `nonlinear` gives, by Newton's steps; each squares an error of a per cent."""
+    """Undo `nonlinear` with some steps of Newton's method.
+
+    Each step squares the relative error, which is about a per cent at first.
+    """
     charge = np.asarray(signal, float)
     for _ in range(steps):
         slope = 1 - charge * (2 * planes[0] + charge * (3 * planes[1] + 4 * charge * planes[2]))
@@ -135,16 +197,23 @@ def linear(signal: np.ndarray, planes: np.ndarray, steps: int = 4) -> np.ndarray
 def interpixel_capacitance(
     signal: np.ndarray, kernels: np.ndarray, block: int, origin: tuple[int, int] = (0, 0)
 ) -> np.ndarray:
-    """Return a signal (ny, nx) after every pixel has spread its own by its own kernel.
+    """Apply interpixel capacitance: spread the signal of every pixel over its neighbours with the pixel's own kernel.
+
+    Signal that would appear beyond the edge is lost.
 
     Parameters
     ----------
-    signal : (ny, nx) float32, electrons
-    kernels : (3, 3, blocks y, blocks x), axes (dy, dx): the share of the source pixel's signal that appears there (IPC)
-    block : pixels along a side of a block
-    origin : row and column of the first pixel on the whole detector
+    signal : ndarray, shape (ny, nx), float32, electrons
+    kernels : ndarray, shape (3, 3, blocks y, blocks x)
+        Share of the source pixel's signal that appears at (dy, dx) from it, for each block of pixels (IPC).
+    block : int
+        Pixels along a side of a block.
+    origin : tuple of int
+        Row and column, on the whole detector, of the first pixel.
 
-    What would appear beyond the edge is lost.
+    Returns
+    -------
+    ndarray, shape (ny, nx), float32, electrons
     """
     kernels = np.ascontiguousarray(np.moveaxis(np.asarray(kernels, np.float32), (0, 1), (2, 3)))
     return _spread(np.ascontiguousarray(signal, np.float32), kernels, block, origin[0], origin[1])
@@ -174,13 +243,24 @@ def _spread(signal, kernels, block, first_row, first_column):
 def without_capacitance(
     signal: np.ndarray, kernels: np.ndarray, block: int, origin: tuple[int, int] = (0, 0), steps: int = 4
 ) -> np.ndarray:
-    """Return the signal that `interpixel_capacitance` spread, by its Neumann series; each step gains a factor of 8."""
-    found = signal.astype(np.float32)
+    """Undo `interpixel_capacitance` with its Neumann series; each step reduces the error by a factor of 8."""
+    corrected = signal.astype(np.float32)
     for _ in range(steps):
-        found = found + (signal - interpixel_capacitance(found, kernels, block, origin))
-    return found
+        corrected = corrected + (signal - interpixel_capacitance(corrected, kernels, block, origin))
+    return corrected
 
 
 def digitise(signal: np.ndarray, gain: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Return data numbers (uint16) of signals in electrons: over the gain (e/DN), plus the bias, rounded, clipped."""
+    """Return the data numbers of a signal: divided by the gain, plus the bias, rounded and clipped.
+
+    Parameters
+    ----------
+    signal : ndarray, electrons
+    gain : ndarray, electrons per data number
+    bias : ndarray, data numbers
+
+    Returns
+    -------
+    ndarray, uint16
+    """
     return np.clip(np.rint(signal / gain + bias), 0, LARGEST_DN).astype(np.uint16)

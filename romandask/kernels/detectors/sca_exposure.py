@@ -1,4 +1,4 @@
-"""One exposure of an SCA: from expected light to data numbers with every effect, and back to electrons of light."""
+"""One exposure of an SCA: from expected light to data numbers with all effects, and back to electrons of light."""
 
 from __future__ import annotations
 
@@ -46,104 +46,131 @@ FLAGS = {
     "persistence": PERSISTENCE,
     "cosmic_ray": COSMIC_RAY_FLAG,
 }
-"""Bits of the dq plane (uint16) beside those of the simple detector."""
-JUMP = 50.0
-"""Electrons of a cosmic ray, in a pixel, that give it away among the reads of an exposure (six times their noise)."""
-LEAST = 0.1
-"""Electrons of trapped charge, f(Q), that are followed: a thousandth of the sky's noise an exposure is far below."""
-_OF_PIXELS = (
+"""Bits of the dq plane (uint16), by name, in addition to those of the simple detector."""
+JUMP_THRESHOLD = 50.0
+"""Charge of a cosmic ray in a pixel above which it shows as a jump between the reads of an exposure, electrons: six
+times the read noise."""
+MIN_TRAPPED_CHARGE = 0.1
+"""Least trapped charge f(Q) that is followed, electrons. It adds at most twice as much to a later exposure, far below
+the noise of the sky."""
+_DQ_OF_BADPIX = (
     (DISCONNECTED, DISCONNECTED_FLAG),
     (HOT, HOT_FLAG),
     (ADJACENT, ADJACENT_FLAG),
     (LOW_EFFICIENCY, LOW_EFFICIENCY_FLAG),
     (NOISY, NOISY_FLAG),
 )
+"""Bits of BADPIX and the bits of the dq plane that they set."""
 _ROWS = 32
-"""Rows that share a random generator, and are worked on while they are in the processor's cache."""
+"""Number of rows that share a random generator and are worked on at a time, so that they stay in the processor's
+cache."""
 
 Planes = Callable[[str, slice], np.ndarray]
-"""Gives some rows of the whole detector (BORDER included) of a named calibration; blocks, whole, where it has those.
+"""Returns rows of a calibration, given its name and the rows.
 
-Of float64 calibrations float32 is enough; READ is the read noise of an exposure alone, electrons.
+Rows are those of the whole detector, reference pixels included. A calibration in blocks is returned whole. float32 is
+enough for float64 calibrations. READ is the read noise of an exposure alone, electrons.
 """
 Generators = Callable[[str, int], np.random.Generator]
-"""Gives the random generator of a named step and a block of rows."""
+"""Returns the random generator of a block of rows in one step, given the name of the step and the block's number."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """How an SCA answers the light of one band."""
+    """Response of an SCA to the light of one band."""
 
     efficiency: np.ndarray
-    """(64, 64) relative quantum efficiency of blocks of 64 pixels, averaged over the band."""
+    """Relative quantum efficiency of blocks of 64 x 64 pixels, averaged over the band, (64, 64)."""
     electrons: np.ndarray
-    """(32, 32) electrons a photon, of blocks of 128 pixels, averaged over the band."""
+    """Electrons per photon in blocks of 128 x 128 pixels, averaged over the band, (32, 32)."""
     exptime: float
-    """Seconds."""
+    """Exposure time, seconds."""
 
 
 @dataclass(frozen=True)
 class Trapped:
-    """Charge that an exposure leaves in traps, pixel by pixel: most have none worth following."""
+    """Charge that an exposure leaves in traps, for the pixels in which it is worth following: a small part of all."""
 
     pixel: np.ndarray
-    """(n,) int32, place in the flattened active area (4088, 4088)."""
+    """Index in the flattened active area of 4088 x 4088 pixels, (n,) int32."""
     charge: np.ndarray
-    """(n,) float32, f(Q), electrons; a time t later its current is f(Q) / t."""
+    """Trapped charge f(Q), (n,) float32, electrons. At a time t after the exposure its current is f(Q) / t."""
 
 
 def accumulate(
     light: np.ndarray, planes: Planes, response: Response, generators: Generators, rays: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the charge (4096, 4096), electrons, that light leaves in pixels, before anything the detector adds.
+    """Draw the charge that light and cosmic rays leave in pixels, before dark current and readout.
 
     Parameters
     ----------
-    light : (4088, 4088) expected electrons of objects, sky and thermal emission, at nominal efficiency
-    rays : (4096, 4096) electrons of cosmic rays (cosmic_rays.hits); None for none
+    light : ndarray, shape (4088, 4088), electrons
+        Expected electrons of sources, sky and thermal emission at nominal efficiency.
+    planes : Planes
+        Calibrations of the SCA.
+    response : Response
+        Response of the SCA in the band.
+    generators : Generators
+    rays : ndarray, shape (4096, 4096), electrons, optional
+        Charge of cosmic rays (`cosmic_rays.hits`); None for no cosmic rays.
+
+    Returns
+    -------
+    ndarray, shape (4096, 4096), float32, electrons
     """
     charge = np.empty((SCA_PIXELS, SCA_PIXELS), np.float32)
     for block, rows in enumerate(_blocks()):
         mean = _padded(light, rows)
         mean = quantum_efficiency(mean, planes("RELQE1", rows), expand(response.efficiency, 64, rows))
         mean = count_rate_nonlinearity(mean, planes("CRNL", rows)[0].astype(np.float32), response.exptime)
-        caught = poisson(np.maximum(mean, 0), generators("light", block))
-        charge[rows] = quantum_yield(caught, expand(response.electrons, 128, rows), generators("yield", block))
+        detected = poisson(np.maximum(mean, 0), generators("light", block))
+        charge[rows] = quantum_yield(detected, expand(response.electrons, 128, rows), generators("yield", block))
     if rays is not None:
         charge += rays
     return brighter_fatter(charge, planes("BFE", slice(None)), 128)
 
 
 def trap(charge: np.ndarray, planes: Planes) -> Trapped:
-    """Return what of a charge (4096, 4096) stays in traps.
+    """Return the part of a charge (4096, 4096), electrons, that stays in traps.
 
-    Left out are pixels with less than half the least charge at which persistence is measured, and those that keep less
-    than LEAST.
+    Pixels with less than half of the lowest charge at which persistence is measured are left out, and pixels with a
+    trapped charge below MIN_TRAPPED_CHARGE.
     """
-    found = []
+    parts = []
     for rows in _blocks():
         first, last = max(rows.start, REFERENCE_PIXELS), min(rows.stop, SCA_PIXELS - REFERENCE_PIXELS)
-        here = np.minimum(
+        clipped = np.minimum(
             charge[first:last, REFERENCE_PIXELS : SCA_PIXELS - REFERENCE_PIXELS],
             planes("SATURATE", slice(first, last))[:, REFERENCE_PIXELS : SCA_PIXELS - REFERENCE_PIXELS],
         )
-        y, x = np.nonzero(here > STIMULI[0] / 2)
+        y, x = np.nonzero(clipped > STIMULI[0] / 2)
         released = persistence(
-            here[y, x], planes("PERSIST", slice(first, last))[:, y, x + REFERENCE_PIXELS].astype(np.float32), 1.0
+            clipped[y, x], planes("PERSIST", slice(first, last))[:, y, x + REFERENCE_PIXELS].astype(np.float32), 1.0
         )
-        kept = released >= LEAST
+        kept = released >= MIN_TRAPPED_CHARGE
         pixel = (y[kept] + first - REFERENCE_PIXELS) * (SCA_PIXELS - 2 * REFERENCE_PIXELS) + x[kept]
-        found.append((pixel.astype(np.int32), released[kept].astype(np.float32)))
-    return Trapped(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        parts.append((pixel.astype(np.int32), released[kept].astype(np.float32)))
+    return Trapped(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def afterglow(left: Sequence[tuple[Trapped, float]]) -> np.ndarray | None:
-    """Return the current (4088, 4088), e/s, of what exposures left, each with its age, s; None where there are none."""
-    if not left:
+def afterglow(earlier: Sequence[tuple[Trapped, float]]) -> np.ndarray | None:
+    """Return the persistence current of the charge that earlier exposures left in traps.
+
+    Parameters
+    ----------
+    earlier : sequence of (Trapped, float)
+        Trapped charge of each earlier exposure, and the time since the exposure ended, seconds.
+
+    Returns
+    -------
+    ndarray, shape (4088, 4088), float32, electrons per second, or None
+        None if there are no earlier exposures.
+    """
+    if not earlier:
         return None
     side = SCA_PIXELS - 2 * REFERENCE_PIXELS
     current = np.zeros(side * side, np.float32)
-    for trapped, age in left:
+    for trapped, age in earlier:
         current[trapped.pixel] += trapped.charge / np.float32(age)
     return current.reshape(side, side)
 
@@ -153,26 +180,38 @@ def read_out(
     planes: Planes,
     response: Response,
     generators: Generators,
-    late: np.ndarray | None = None,
+    persistence_current: np.ndarray | None = None,
     rays: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return data numbers (uint16) and dq (uint16), both (4088, 4088), of the charge (4096, 4096) of an exposure.
+    """Read out the charge of an exposure.
 
     Parameters
     ----------
-    late : (4088, 4088) current, e/s, of charge that earlier exposures left (`afterglow`); None for none
-    rays : (4096, 4096) electrons of cosmic rays that are in the charge; None for none
+    charge : ndarray, shape (4096, 4096), electrons
+        As `accumulate` returns it.
+    planes, response, generators
+        As in `accumulate`.
+    persistence_current : ndarray, shape (4088, 4088), electrons per second, optional
+        Current of the charge that earlier exposures left in traps (`afterglow`); None for none.
+    rays : ndarray, shape (4096, 4096), electrons, optional
+        Charge of the cosmic rays that are in `charge`; None for no cosmic rays.
+
+    Returns
+    -------
+    numbers : ndarray, shape (4088, 4088), uint16, data numbers
+    dq : ndarray, shape (4088, 4088), uint16
+        Bits of FLAGS and of the simple detector.
     """
     inner = slice(REFERENCE_PIXELS, SCA_PIXELS - REFERENCE_PIXELS)
     dq = np.zeros((SCA_PIXELS, SCA_PIXELS), np.uint16)
     if rays is not None:
-        dq[rays > JUMP] |= COSMIC_RAY_FLAG
+        dq[rays > JUMP_THRESHOLD] |= COSMIC_RAY_FLAG
     signal = np.empty((SCA_PIXELS, SCA_PIXELS), np.float32)
     for block, rows in enumerate(_blocks()):
         dark = planes("DARK", rows).astype(np.float32) * np.float32(response.exptime)
-        if late is not None:
-            added = _padded(late, rows) * np.float32(response.exptime)
-            # what is more than the noise of the sky's own electrons in the least
+        if persistence_current is not None:
+            added = _padded(persistence_current, rows) * np.float32(response.exptime)
+            # flag pixels to which persistence adds more than an electron
             dq[rows][added > 1] |= PERSISTENCE
             dark = dark + added
         electrons = np.rint(charge[rows]) + poisson(dark, generators("dark", block))
@@ -182,22 +221,35 @@ def read_out(
     signal = interpixel_capacitance(signal, planes("IPC", slice(None)), 8)
     numbers = np.empty((SCA_PIXELS, SCA_PIXELS), np.uint16)
     for block, rows in enumerate(_blocks()):
-        bits, here = planes("BADPIX", rows), signal[rows]
-        here[bits & DISCONNECTED > 0] = 0
-        for bit, flag in _OF_PIXELS:
+        bits, block_signal = planes("BADPIX", rows), signal[rows]
+        block_signal[bits & DISCONNECTED > 0] = 0
+        for bit, flag in _DQ_OF_BADPIX:
             dq[rows][bits & bit > 0] |= flag
-        noise = generators("read", block).standard_normal(here.shape, np.float32)
-        here += noise * planes("READ", rows).astype(np.float32)
-        numbers[rows] = digitise(here, expand(planes("GAIN", slice(None)), 128, rows), planes("BIAS", rows))
+        noise = generators("read", block).standard_normal(block_signal.shape, np.float32)
+        block_signal += noise * planes("READ", rows).astype(np.float32)
+        numbers[rows] = digitise(block_signal, expand(planes("GAIN", slice(None)), 128, rows), planes("BIAS", rows))
     return numbers[inner, inner], dq[inner, inner]
 
 
 def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[np.ndarray, np.ndarray]:
-    """Return electrons of light at nominal efficiency (4088, 4088), sky included, and their variance, of data numbers.
+    """Calibrate data numbers: return the electrons of light at nominal efficiency, and their variance.
 
-    Bias, gain, interpixel capacitance, classical nonlinearity, dark current, quantum efficiency and count-rate
-    nonlinearity are undone, with the detector's own calibration; the brighter-fatter effect, which moves charge between
-    neighbours and loses none, is not. Of pixels that catch no light both results are 0.
+    Corrected for are bias, gain, interpixel capacitance, classical nonlinearity, dark current, quantum efficiency and
+    count-rate nonlinearity, with the calibrations of the SCA itself. The brighter-fatter effect, which moves charge
+    between neighbours and conserves the total, is not corrected for.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (4088, 4088), data numbers
+    planes, response
+        As in `accumulate`.
+
+    Returns
+    -------
+    light : ndarray, shape (4088, 4088), float32, electrons
+        It includes the sky; 0 for pixels that detect no light.
+    variance : ndarray, shape (4088, 4088), float32, electrons^2
+        0 for pixels that detect no light.
     """
     inner = slice(REFERENCE_PIXELS, SCA_PIXELS - REFERENCE_PIXELS)
     signal = np.zeros((SCA_PIXELS, SCA_PIXELS), np.float32)
@@ -206,7 +258,7 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
     for rows in _blocks():
         gain = expand(planes("GAIN", slice(None)), 128, rows)
         signal[rows] = (signal[rows] - planes("BIAS", rows)) * gain
-    # beyond what was read there is nothing
+    # reference pixels were not read out
     edge = np.ones((SCA_PIXELS, SCA_PIXELS), bool)
     edge[inner, inner] = False
     signal[edge] = 0
@@ -218,7 +270,7 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
         relative = planes("RELQE1", rows) * expand(response.efficiency, 64, rows)
         relative = relative * expand(response.electrons, 128, rows)
         gain = expand(planes("GAIN", slice(None)), 128, rows)
-        # noise that was added after the signal had spread grows with its inverse, by the sum of its squares
+        # read noise is added after interpixel capacitance: its correction amplifies it by the sum of its squares
         middle = expand(kernels[1, 1], 8, rows)
         grown = 1 / middle**2 * (1 + (1 - middle) ** 2 / 4 / middle**2)
         read = planes("READ", rows).astype(np.float32) ** 2 + gain**2 / 12
@@ -233,11 +285,12 @@ def calibrate(numbers: np.ndarray, planes: Planes, response: Response) -> tuple[
 
 
 def _blocks() -> list[slice]:
+    """Return the blocks of rows of the whole detector."""
     return [slice(first, first + _ROWS) for first in range(0, SCA_PIXELS, _ROWS)]
 
 
 def _padded(image: np.ndarray, rows: slice) -> np.ndarray:
-    """Return rows of the whole detector of an image of its active pixels: reference pixels have nothing."""
+    """Return some rows of the whole detector, given the image of its active pixels; reference pixels are 0."""
     out = np.zeros((rows.stop - rows.start, SCA_PIXELS), np.float32)
     first, last = max(rows.start - REFERENCE_PIXELS, 0), min(rows.stop - REFERENCE_PIXELS, image.shape[0])
     out[

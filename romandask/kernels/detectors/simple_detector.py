@@ -1,4 +1,4 @@
-"""The simple detector: sky, Poisson noise, saturation, read noise, whole electrons."""
+"""The simple detector model: sky, Poisson noise, saturation, read noise, rounding to whole electrons."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from romandask.kernels.detectors.poisson import poisson
 
 SATURATED, NO_DATA, PERSISTENCE = 1, 2, 128
 DQ_FLAGS = {"saturated": SATURATED, "no_data": NO_DATA}
-"""Bits of the dq plane."""
-TELLING = PERSISTENCE
-"""Bits that tell something of a pixel and leave it usable; one with any other is not used."""
+"""Bits of the dq plane, by name."""
+INFORMATIONAL_FLAGS = PERSISTENCE
+"""Bits that leave a pixel usable. A pixel with any other bit is not used."""
 _ROWS = 64
-"""Rows that are worked on while they are in the processor's cache."""
+"""Number of rows that are worked on at a time, so that they stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -23,30 +23,41 @@ class Detector:
     """Constants of a simple detector."""
 
     saturation: float
-    """Electrons at which a pixel is clipped."""
+    """Charge at which a pixel is clipped, electrons."""
     read_noise: float
-    """Electrons rms of an exposure."""
+    """Read noise of an exposure, electrons rms."""
 
 
 def observe(
     expected: np.ndarray, background: np.ndarray, detector: Detector, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the observed image (int32, electrons) and its dq plane (uint8).
+    """Draw the observed image of an exposure.
+
+    Poisson noise is drawn once per pixel, for sources and background together. The electrons are clipped at saturation,
+    then Gaussian read noise is added (simple model of Troxel et al. 2023, section 4.3). Rows are drawn in blocks, which
+    limits the memory.
 
     Parameters
     ----------
-    expected : (ny, nx) electrons of the objects, noiseless
-    background : (ny, nx) or scalar; electrons of sky, thermal emission and dark current
+    expected : ndarray, shape (ny, nx), electrons
+        Noiseless image of the sources.
+    background : ndarray, shape (ny, nx), or float, electrons
+        Sky, thermal emission and dark current.
+    detector : Detector
+    rng : Generator
 
-    Poisson noise is drawn once per pixel from objects and background together, then clipped at saturation, then
-    Gaussian read noise is added (paper, section 4.3, simple model). Rows are drawn in blocks that bound memory.
+    Returns
+    -------
+    image : ndarray, shape (ny, nx), int32, electrons
+    dq : ndarray, shape (ny, nx), uint8
+        Bits of DQ_FLAGS.
     """
     image = np.empty(expected.shape, np.int32)
     dq = np.zeros(expected.shape, np.uint8)
     background = np.broadcast_to(background, expected.shape)
     for first in range(0, expected.shape[0], _ROWS):
         rows = slice(first, first + _ROWS)
-        # Fourier rendering rings slightly below zero, far below the background
+        # rendering by Fourier transforms leaves slightly negative values, far smaller than the background
         mean = np.maximum(expected[rows] + background[rows], np.float32(0))
         electrons = poisson(mean, rng)
         full = electrons >= detector.saturation
@@ -58,12 +69,12 @@ def observe(
 
 
 NOISE_ROWS = 256
-"""Rows whose noise realisation shares one generator: parts of an image need not draw the whole."""
+"""Rows of a noise realisation that share one random generator: a part of an image is drawn without the rest."""
 
 
 def usable(dq: np.ndarray) -> np.ndarray:
-    """True for pixels that may be measured."""
-    return dq & ~np.array(TELLING, dq.dtype) == 0
+    """Return a mask of the pixels that may be measured, from a dq plane."""
+    return dq & ~np.array(INFORMATIONAL_FLAGS, dq.dtype) == 0
 
 
 def noise_realisation(
@@ -73,15 +84,24 @@ def noise_realisation(
     columns: slice,
     generator: Callable[[int], np.random.Generator],
 ) -> np.ndarray:
-    """Return noise (float32, electrons) of zero mean and some variance.
+    """Draw Gaussian noise of zero mean and given variance for a part of a detector.
+
+    The value of a pixel does not depend on which part of the detector is requested.
 
     Parameters
     ----------
-    variance : (ny, nx) electrons^2, of the rows and columns wanted
-    width : columns of the whole detector
-    generator : the random generator of a block of rows, by its number
+    variance : ndarray, shape (rows, columns), electrons^2
+        Variance of the requested pixels.
+    width : int
+        Columns of the whole detector.
+    rows, columns : slice
+        The requested part of the detector.
+    generator : callable
+        Returns the random generator of a block of NOISE_ROWS rows, given the number of the block.
 
-    The values of a pixel do not depend on which part of the detector is asked for.
+    Returns
+    -------
+    ndarray, shape (rows, columns), float32, electrons
     """
     noise = np.empty(variance.shape, np.float32)
     for block in range(rows.start // NOISE_ROWS, -(-rows.stop // NOISE_ROWS)):

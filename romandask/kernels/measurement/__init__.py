@@ -1,1 +1,1 @@
-"""Detection, photometry, matching and statistics on arrays."""
+"""Detection, photometry, image differences, matching and shear statistics, on arrays."""

@@ -1,4 +1,4 @@
-"""Convolution by Fourier transforms, in single precision."""
+"""Convolution with Fourier transforms, in single precision."""
 
 from __future__ import annotations
 
@@ -7,9 +7,18 @@ from scipy import fft
 
 
 def convolve(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-    """Return an image (ny, nx), float32, convolved with an odd kernel: beyond its edges there is nothing.
+    """Return an image convolved with a kernel; the image is taken to be 0 beyond its edges.
 
-    By itself, for scipy.signal takes 50 MB of every worker that imports it.
+    This replaces `scipy.signal.fftconvolve`, because importing scipy.signal takes 50 MB in every worker.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+    kernel : ndarray, shape (odd, odd)
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), float32
     """
     ny, nx = image.shape
     v, u = kernel.shape

@@ -1,4 +1,4 @@
-"""Counterparts of measured objects among the true ones: near on the sky, then alike in magnitude."""
+"""Counterparts of measured objects among true objects, chosen by separation and magnitude."""
 
 from __future__ import annotations
 
@@ -8,31 +8,34 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 NEIGHBOURS = 3
-"""True objects, the nearest, among which the counterpart is chosen (Troxel et al. 2023, section 5.3)."""
+"""Number of nearest true objects among which the counterpart is chosen (Troxel et al. 2023, section 5.3)."""
 
 
 @dataclass(frozen=True)
 class Counterparts:
-    """Of each measured object, arrays (n,)."""
+    """Counterparts of n measured objects."""
 
     row: np.ndarray
-    """Row of its counterpart in the true ones; -1 where there is none."""
+    """Row of the counterpart among the true objects, (n,); -1 for none."""
     separation: np.ndarray
-    """Radians; NaN where there is none."""
+    """Separation from the counterpart, (n,), radians; NaN for none."""
     candidates: np.ndarray
-    """True objects within the radius, at most NEIGHBOURS."""
+    """Number of true objects within the radius, (n,), at most NEIGHBOURS."""
 
 
 def counterparts(
     measured: np.ndarray, magnitude: np.ndarray, true: np.ndarray, true_magnitude: np.ndarray, radius: float
 ) -> Counterparts:
-    """Return the counterpart of each object: of its nearest neighbours within a radius the closest in magnitude.
+    """Return the counterpart of each object: the closest in magnitude among its nearest neighbours within a radius.
 
     Parameters
     ----------
-    measured, true : (n, 3) and (m, 3) unit vectors
-    magnitude, true_magnitude : (n,) and (m,); where one is not known, the nearest is taken
-    radius : radians
+    measured, true : ndarray, shape (n, 3) and (m, 3)
+        Unit vectors of the measured and of the true objects.
+    magnitude, true_magnitude : ndarray, shape (n,) and (m,), mag
+        A true object without a finite difference in magnitude is chosen only if no other has one, the nearest first.
+    radius : float, radians
+        Largest separation of a counterpart.
     """
     n = len(measured)
     if not n or not len(true):
@@ -41,11 +44,11 @@ def counterparts(
     distance, row = cKDTree(true).query(measured, k=NEIGHBOURS, distance_upper_bound=chord)
     near = np.isfinite(distance)
     candidate = np.where(near, row, 0)
-    apart = np.abs(true_magnitude[candidate] - magnitude[:, None])
-    # a magnitude that is not known decides nothing: the order of distance does
-    apart = np.where(near, np.where(np.isfinite(apart), apart, 1e3 + distance), np.inf)
-    best = np.argmin(apart, axis=1)[:, None]
-    found = near.any(axis=1)
+    difference = np.abs(true_magnitude[candidate] - magnitude[:, None])
+    # candidates without a magnitude are ordered by distance
+    difference = np.where(near, np.where(np.isfinite(difference), difference, 1e3 + distance), np.inf)
+    best = np.argmin(difference, axis=1)[:, None]
+    matched = near.any(axis=1)
     chosen = np.take_along_axis(candidate, best, 1)[:, 0]
     separation = 2 * np.arcsin(np.take_along_axis(np.where(near, distance, 0), best, 1)[:, 0] / 2)
-    return Counterparts(np.where(found, chosen, -1), np.where(found, separation, np.nan), near.sum(axis=1))
+    return Counterparts(np.where(matched, chosen, -1), np.where(matched, separation, np.nan), near.sum(axis=1))

@@ -1,43 +1,61 @@
-"""Counts of objects against magnitude, and where they are no longer complete."""
+"""Number counts of objects against magnitude, and the magnitude at which they become incomplete."""
 
 from __future__ import annotations
 
 import numpy as np
 
-FIRST, LAST = 21.0, 26.0
+BRIGHTEST, FAINTEST = 21.0, 26.0
 """Magnitudes between which counts follow a power law (Troxel et al. 2023, section 6)."""
-SHARE = 0.8
-"""Completeness at the limit."""
-LEAST = 100
-"""Objects without which nothing is fitted."""
+LIMIT_COMPLETENESS = 0.8
+"""Completeness at the limiting magnitude."""
+MIN_OBJECTS = 100
+"""Smallest number of objects to which a power law is fitted."""
 
 
 def counts_limit(counts: np.ndarray, edges: np.ndarray) -> tuple[float, float]:
-    """Return the magnitude at which counts (n,) in bins (n + 1 edges) fall to 80% of a power law, and its slope.
+    """Return the magnitude at which counts fall to 80% of a power law, and the slope of the power law.
 
-    The power law, log10 of counts against magnitude, is fitted between 21 and 26 mag to what is brighter by half a
-    magnitude than where counts fall below it: the limit itself decides what is complete enough to be fitted. Infinite,
-    and NaN, where there are too few objects, or where counts do not fall before the last bin.
+    The power law is a straight line in log10 of the counts against magnitude. It is fitted to bins between 21 and 26
+    mag that are at least half a magnitude brighter than the limit, and to no fewer than the four brightest. Fit and
+    limit are iterated.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n,)
+        Number of objects in each bin.
+    edges : ndarray, shape (n + 1,), mag
+        Edges of the bins.
+
+    Returns
+    -------
+    limit : float, mag
+        Infinite if there are too few objects, or if the counts do not fall below 80% before the last bin.
+    slope : float, 1/mag
+        NaN if there are too few objects.
     """
     middle = (edges[1:] + edges[:-1]) / 2
-    used = (middle >= FIRST) & (middle <= LAST) & (counts > 0)
-    if counts[used].sum() < LEAST or used.sum() < 4:
+    in_range = (middle >= BRIGHTEST) & (middle <= FAINTEST) & (counts > 0)
+    if counts[in_range].sum() < MIN_OBJECTS or in_range.sum() < 4:
         return np.inf, np.nan
-    # counts have passed their peak where they are incomplete, whatever the slope
-    peak = middle[used][np.argmax(np.convolve(counts[used], np.ones(3), "same"))]
+    # start from the peak of the counts: fainter bins are incomplete, whatever the slope
+    peak = middle[in_range][np.argmax(np.convolve(counts[in_range], np.ones(3), "same"))]
     limit, slope = float(peak), np.nan
     for _ in range(20):
-        fitted = used & (middle <= max(limit - 0.5, middle[used][3]))
-        slope, zero = np.polyfit(middle[fitted], np.log10(counts[fitted]), 1, w=np.sqrt(counts[fitted]))
-        share = counts / 10 ** (zero + slope * middle)
-        # from here on every bin of two together is below: one low bin is chance
-        low = np.flatnonzero((share[:-1] < SHARE) & (share[1:] < SHARE) & (middle[:-1] > middle[fitted][-1]))
+        fitted = in_range & (middle <= max(limit - 0.5, middle[in_range][3]))
+        slope, intercept = np.polyfit(middle[fitted], np.log10(counts[fitted]), 1, w=np.sqrt(counts[fitted]))
+        completeness = counts / 10 ** (intercept + slope * middle)
+        # require two neighbouring low bins: a single one may be a fluctuation
+        low = np.flatnonzero(
+            (completeness[:-1] < LIMIT_COMPLETENESS)
+            & (completeness[1:] < LIMIT_COMPLETENESS)
+            & (middle[:-1] > middle[fitted][-1])
+        )
         if not len(low) or counts[low[0] :].sum() == 0:
             return np.inf, float(slope)
         k = low[0]
-        before, after = share[k - 1], share[k]
-        place = middle[k - 1] + (before - SHARE) / (before - after) * (middle[k] - middle[k - 1])
-        new = float(np.clip(place, middle[k - 1], middle[k]))
+        before, after = completeness[k - 1], completeness[k]
+        crossing = middle[k - 1] + (before - LIMIT_COMPLETENESS) / (before - after) * (middle[k] - middle[k - 1])
+        new = float(np.clip(crossing, middle[k - 1], middle[k]))
         if abs(new - limit) < 1e-6:
             break
         limit = new

@@ -1,4 +1,4 @@
-"""Friends of friends: links on a grid, minimum spanning forests, and the groups of any length that they hold."""
+"""Friends of friends: links between near objects, their minimum spanning forest, and its groups for any length."""
 
 from __future__ import annotations
 
@@ -9,14 +9,26 @@ from romandask.model.sky import ARCSEC, chord
 
 
 def links(vectors: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs (m, 2) of rows of unit vectors (n, 3) that are no further apart than `length` arcsec, and their
-    separations (m,) in arcsec.
+    """Return all pairs of objects within a linking length.
 
-    Objects are sorted by the cells, `length` wide, of a grid in space: each is compared with those of its own cell and
-    of half of the cells around it, so that no pair is met twice.
+    Objects are sorted by the cells of a grid in space that are one linking length wide. Each object is compared with
+    the objects of its own cell and of half of the neighbouring cells, so that no pair is found twice.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (n, 3)
+        Unit vectors of the objects.
+    length : float, arcsec
+        Linking length.
+
+    Returns
+    -------
+    pairs : ndarray, shape (m, 2)
+        Rows of the two objects of each pair.
+    separation : ndarray, shape (m,), arcsec
     """
     limit = chord(length)
-    # a cell of room on either side: no row of cells runs into the next
+    # one empty cell on either side, so that neighbouring keys are neighbouring cells
     side = int(2 / limit) + 3
     cells = ((vectors + 1) / limit).astype(np.int64) + 1
     key = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
@@ -27,10 +39,11 @@ def links(vectors: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(nogil=True, cache=True)
 def _near(key, vectors, limit2, side):
+    """Return the pairs of rows and their squared chords, for objects sorted by the key of their cell."""
     n, count = len(key), 0
     pairs, gaps = np.empty((n + 16, 2), np.int64), np.empty(n + 16)
     for dx, dy in ((0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):
-        # three cells in a row of the third axis follow one another; the first of them moves on with the object
+        # three neighbouring cells along the third axis have consecutive keys; `first` advances with the object
         first, shift = 0, (dx * side + dy) * side
         for i in range(n):
             low, high = key[i] + shift - 1, key[i] + shift + 1
@@ -54,16 +67,27 @@ def _near(key, vectors, limit2, side):
 
 
 def forest(count: int, pairs: np.ndarray, gap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum spanning forest of links as (into, joined): how groups grow together, shortest links first.
+    """Return the minimum spanning forest of links, as the merges of groups with increasing linking length.
 
-    A group is named after its first row. When a link of separation `gap` brings two together, the name of the one with
-    the later row ends: `into` (count,) is the row whose group it becomes part of, `joined` the separation, infinite
-    for a row whose name never ends. What separations follow from row to row do not decrease, so that the groups of a
-    length are found by following them as long as they do not exceed it.
+    A group is identified by its first row. When a link merges two groups, the group with the later first row becomes
+    part of the other. Along a chain of merges the separations do not decrease. The group of a row, for a given linking
+    length, is therefore found by following the merges whose separation does not exceed the length (`label`).
 
     Parameters
     ----------
-    pairs, gap : (m, 2) and (m,): linked rows and their separations
+    count : int
+        Number of objects.
+    pairs : ndarray, shape (m, 2)
+        Linked rows.
+    gap : ndarray, shape (m,)
+        Their separations.
+
+    Returns
+    -------
+    into : ndarray, shape (count,)
+        Row that identifies the group into which the group of each row is merged; the row itself if it never is.
+    joined : ndarray, shape (count,)
+        Separation of the link that merges the groups; infinite if the group is never merged.
     """
     order = np.argsort(gap, kind="stable")
     return _grow(count, pairs[order], gap[order])
@@ -71,6 +95,7 @@ def forest(count: int, pairs: np.ndarray, gap: np.ndarray) -> tuple[np.ndarray, 
 
 @numba.njit(nogil=True, cache=True)
 def _grow(count, pairs, gap):
+    """Return `into` and `joined` for links in order of separation (union-find with path halving)."""
     root, into, joined = np.arange(count), np.arange(count), np.full(count, np.inf)
     for k in range(len(gap)):
         a, b = pairs[k, 0], pairs[k, 1]
@@ -88,7 +113,15 @@ def _grow(count, pairs, gap):
 
 
 def label(into: np.ndarray, joined: np.ndarray, length: float) -> np.ndarray:
-    """Return the first row of each row's group (n,) for a linking length no longer than the forest's."""
+    """Return the first row of the group of each row, (n,).
+
+    Parameters
+    ----------
+    into, joined : ndarray, shape (n,)
+        As `forest` returns them.
+    length : float
+        Linking length, in the unit of `joined`, no longer than that of the links of the forest.
+    """
     rows = np.arange(len(into))
     target = np.where(joined <= length, into, rows)
     while True:

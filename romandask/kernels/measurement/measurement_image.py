@@ -1,4 +1,4 @@
-"""One band of a tile, or its detection image, as photometry needs it: flux, error, and how its noise is correlated."""
+"""Measurement images: one band of a tile, or its detection image, with its errors and noise correlations."""
 
 from __future__ import annotations
 
@@ -9,65 +9,100 @@ import numpy as np
 import sep
 
 NOISE_RADII = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 14.0, 20.0])
-"""Radii of the apertures on which the correlations of the noise are measured, pixels."""
+"""Radii of the apertures in which the correlation of the noise is measured, pixels."""
 TRIALS = 2000
-"""Apertures of each radius."""
-_SAMPLES = 4_000_000
-"""Pixels from which the rms is found."""
+"""Number of apertures of each radius."""
+_RMS_PIXELS = 4_000_000
+"""Approximate number of pixels from which the rms of the noise is measured."""
 
 
 @dataclass(frozen=True)
 class MeasurementImage:
-    """One band of a tile, or its detection image."""
+    """One band of a tile, or its detection image, as photometry needs it."""
 
     image: np.ndarray
-    """(ny, nx) float32, flux of a pixel."""
+    """Flux of a pixel, (ny, nx) float32."""
     error: np.ndarray
-    """(ny, nx) float32, rms of an empty pixel; 0 for no data."""
+    """Rms of an empty pixel, (ny, nx) float32; 0 for no data."""
     mask: np.ndarray
-    """(ny, nx) True for no data."""
-    ratios: np.ndarray
-    """By radius of NOISE_RADII: scatter of apertures on the noise over that of white noise."""
+    """True for no data, (ny, nx)."""
+    aperture_ratios: np.ndarray
+    """Scatter of aperture fluxes in the noise over that in white noise, (len(NOISE_RADII),)."""
     psf: np.ndarray
-    """(side, side) unit star."""
+    """PSF of unit flux, (side, side)."""
     psf_ratio: float = 1.0
-    """Scatter of PSF fits to the noise over that of white noise."""
-    electrons: float = 0.0
-    """Electrons per unit flux and second of exposure, or what else the exposure is counted in; 0 for no Poisson noise
-    of the objects."""
+    """Scatter of fluxes from PSF fits to the noise over that in white noise."""
+    electrons_per_flux: float = 0.0
+    """Electrons per unit flux and unit exposure, which is a second or the unit of `exposure_map`; 0 for no Poisson
+    noise of the sources."""
     rms: float = 1.0
-    """Error of a pixel with an exposure of one second: its exposure is (rms / error)^2."""
-    exposures: np.ndarray | None = None
-    """(ny, nx) exposure, where the error does not tell it."""
+    """Error of a pixel with unit exposure. Without `exposure_map`, the exposure of a pixel is (rms / error)^2."""
+    exposure_map: np.ndarray | None = None
+    """Exposure of each pixel, (ny, nx), where the errors do not determine it."""
 
-    def poisson(self, flux: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the variance that the objects' own light adds to their fluxes."""
-        if not self.electrons:
+    def source_variance(self, flux: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the variance that the Poisson noise of sources adds to their fluxes.
+
+        Parameters
+        ----------
+        flux : ndarray, shape (n,)
+        x, y : ndarray, shape (n,), pixels
+
+        Returns
+        -------
+        ndarray, shape (n,), flux^2
+        """
+        if not self.electrons_per_flux:
             return np.zeros(len(x))
-        if self.exposures is not None:
-            exposure = at(self.exposures, x, y).astype(float)
+        if self.exposure_map is not None:
+            exposure = pixel_values(self.exposure_map, x, y).astype(float)
         else:
-            error = at(self.error, x, y).astype(float)
+            error = pixel_values(self.error, x, y).astype(float)
             exposure = np.where(error > 0, self.rms / np.where(error > 0, error, 1), 0) ** 2
-        return np.maximum(np.nan_to_num(flux), 0) / np.maximum(exposure * self.electrons, 1e-6)
+        return np.maximum(np.nan_to_num(flux), 0) / np.maximum(exposure * self.electrons_per_flux, 1e-6)
 
-    def ratio(self, radius: np.ndarray | float) -> np.ndarray:
-        """Return how much larger the scatter of an aperture is than that of white noise."""
-        return np.interp(radius, NOISE_RADII, self.ratios)
+    def aperture_ratio(self, radius: np.ndarray | float) -> np.ndarray:
+        """Return the scatter of aperture fluxes over that in white noise, for aperture radii in pixels."""
+        return np.interp(radius, NOISE_RADII, self.aperture_ratios)
 
 
 def rms_of(noise: np.ndarray, weight: np.ndarray) -> float:
-    """Return the rms of a noise realisation times the root of its weight, robustly; 0 where there is no weight."""
-    step = max(1, int(np.sqrt(noise.size / _SAMPLES)))
-    some = weight[::step, ::step]
-    scaled = noise[::step, ::step][some > 0] * np.sqrt(some[some > 0])
+    """Return the robust rms of a noise realisation times the square root of its weight.
+
+    Parameters
+    ----------
+    noise, weight : ndarray, shape (ny, nx)
+
+    Returns
+    -------
+    float
+        1.4826 times the median absolute deviation; 0 if no pixel has weight.
+    """
+    step = max(1, int(np.sqrt(noise.size / _RMS_PIXELS)))
+    sampled = weight[::step, ::step]
+    scaled = noise[::step, ::step][sampled > 0] * np.sqrt(sampled[sampled > 0])
     if not len(scaled):
         return 0.0
     return float(1.4826 * np.median(np.abs(scaled - np.median(scaled))))
 
 
 def errors(weight: np.ndarray, rms: float) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a weight, in its place, to the rms of a pixel, 0 for no data; return it and the mask of no data."""
+    """Convert a weight, in place, to the rms of a pixel.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (ny, nx), float32
+        It is overwritten.
+    rms : float
+        Rms of a pixel of unit weight (`rms_of`).
+
+    Returns
+    -------
+    error : ndarray, shape (ny, nx), float32
+        `weight` itself: the rms of each pixel, 0 for no data.
+    mask : ndarray, shape (ny, nx), bool
+        True for no data.
+    """
     mask = weight <= 0
     weight[mask] = 1
     np.sqrt(weight, out=weight)
@@ -77,10 +112,22 @@ def errors(weight: np.ndarray, rms: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def noise_ratios(noise: np.ndarray, error: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return, by radius of NOISE_RADII, the scatter of apertures on a noise realisation over that of white noise."""
+    """Return the scatter of aperture fluxes in a noise realisation over that in white noise.
+
+    Parameters
+    ----------
+    noise, error, mask : ndarray, shape (ny, nx)
+        Noise realisation, rms of a pixel, and True for no data.
+
+    Returns
+    -------
+    ndarray, shape (len(NOISE_RADII),)
+        Ratio for each radius. For radii too large for the image, it is that of the largest radius that fits; 1
+        where too few apertures have data.
+    """
     ratios = np.ones(len(NOISE_RADII))
     ny, nx = noise.shape
-    # the positions only sample the realisation: any fixed sequence will do
+    # the positions only sample the realisation, so any fixed sequence is good enough
     random = np.random.default_rng(0)
     for k, radius in enumerate(NOISE_RADII):
         if min(ny, nx) < 4 * radius:
@@ -95,7 +142,18 @@ def noise_ratios(noise: np.ndarray, error: np.ndarray, mask: np.ndarray) -> np.n
 
 
 def median(planes: list[np.ndarray], weights: list[np.ndarray]) -> np.ndarray:
-    """Return the median over bands (ny, nx): a band counts where it has weight, and 0 stands for no data."""
+    """Return the median over the bands that have weight in a pixel.
+
+    Parameters
+    ----------
+    planes, weights : list of ndarray, shape (ny, nx), float32
+        Image and weight of each band.
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), float32
+        0 where no band has weight.
+    """
     return _median(tuple(planes), tuple(weights))
 
 
@@ -106,26 +164,26 @@ def _median(planes, weights):
     values = np.empty(bands, np.float32)
     for y in range(ny):
         if bands == 4:
-            # the two middle ones of four, by a selection network; where a band is missing it is done again below
+            # mean of the two middle values of four, from a selection network; pixels without all bands are redone below
             for x in range(nx):
                 a, b, c, d = planes[0][y, x], planes[1][y, x], planes[2][y, x], planes[3][y, x]
                 low = max(min(a, b), min(c, d))
                 high = min(max(a, b), max(c, d))
                 out[y, x] = (low + high) * np.float32(0.5)
         for x in range(nx):
-            whole = bands == 4
+            complete = bands == 4
             for weight in weights:
-                whole &= weight[y, x] > 0
-            if whole:
+                complete &= weight[y, x] > 0
+            if complete:
                 continue
             count = 0
             for band in range(bands):
                 if weights[band][y, x] > 0:
-                    value, place = planes[band][y, x], count
-                    while place > 0 and values[place - 1] > value:
-                        values[place] = values[place - 1]
-                        place -= 1
-                    values[place] = value
+                    value, index = planes[band][y, x], count
+                    while index > 0 and values[index - 1] > value:
+                        values[index] = values[index - 1]
+                        index -= 1
+                    values[index] = value
                     count += 1
             out[y, x] = 0
             if count > 0:
@@ -136,7 +194,22 @@ def _median(planes, weights):
 def weighted_mean(
     planes: list[np.ndarray], weights: list[np.ndarray], rms: list[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over bands with inverse variances, the best for a flat spectrum, and their sum (both float32)."""
+    """Return the inverse-variance weighted mean over bands, which is optimal for sources with a flat spectrum.
+
+    Parameters
+    ----------
+    planes, weights : list of ndarray, shape (ny, nx)
+        Image and weight of each band.
+    rms : list of float
+        Rms of a pixel of unit weight in each band; a band with 0 is left out.
+
+    Returns
+    -------
+    mean : ndarray, shape (ny, nx), float32
+        0 where no band has weight.
+    total : ndarray, shape (ny, nx), float32
+        Sum of the inverse variances.
+    """
     total = np.zeros(planes[0].shape)
     mean = np.zeros(planes[0].shape)
     for plane, weight, scale in zip(planes, weights, rms, strict=True):
@@ -147,8 +220,8 @@ def weighted_mean(
     return np.where(total > 0, mean / np.where(total > 0, total, 1), 0).astype(np.float32), total.astype(np.float32)
 
 
-def at(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a plane at the pixels of positions."""
+def pixel_values(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the values of a plane (ny, nx) in the pixels nearest to positions x and y, (n,) pixels."""
     ix = np.clip(np.rint(x).astype(int), 0, plane.shape[1] - 1)
     iy = np.clip(np.rint(y).astype(int), 0, plane.shape[0] - 1)
     return plane[iy, ix]

@@ -1,4 +1,4 @@
-"""Objects as peaks of an image smoothed with its PSF, each with the pixels from which the way up leads to it."""
+"""Detection of objects as peaks of the PSF-smoothed image; a pixel belongs to the peak that is uphill of it."""
 
 from __future__ import annotations
 
@@ -10,32 +10,37 @@ import numpy as np
 from romandask.kernels.measurement.convolve import convolve
 from romandask.kernels.measurement.measurement_image import MeasurementImage
 
-KERNEL = 8
-"""Half the side of the PSF that is smoothed with, pixels."""
+KERNEL_HALF_WIDTH = 8
+"""Half the width of the smoothing kernel, a cutout of the PSF, pixels."""
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Peaks of a detection image, and what belongs to each."""
+    """Peaks of a detection image and their pixels."""
 
     segments: np.ndarray
-    """(ny, nx) int32: number of the peak, from 1; 0 for none."""
+    """Number, from 1, of the peak to which a pixel belongs, (ny, nx) int32; 0 for none."""
     snr: np.ndarray
-    """(n,) signal to noise, of a point source, at each peak."""
+    """Signal to noise of a point source at each peak, (n,)."""
     touching: np.ndarray
-    """(n,) True where its pixels touch another's."""
+    """True for peaks with pixels next to pixels of another peak, (n,)."""
 
 
-def find_peaks(layer: MeasurementImage, threshold: float, min_area: int, min_snr: float) -> Peaks:
-    """Return the peaks of the PSF-smoothed image: what Rubin's pipelines detect (Bosch et al. 2018, section 4.7).
+def find_peaks(measurement: MeasurementImage, threshold: float, min_area: int, min_snr: float) -> Peaks:
+    """Return the peaks of the PSF-smoothed image, as Rubin's pipelines detect them (Bosch et al. 2018, section 4.7).
 
     Parameters
     ----------
-    threshold : signal to noise of the smoothed image down to which pixels belong to an object
-    min_area : least number of pixels of an object
-    min_snr : least signal to noise at its peak
+    measurement : MeasurementImage
+        Detection image.
+    threshold : float
+        Signal to noise of the smoothed image above which pixels belong to an object.
+    min_area : int
+        Smallest number of pixels of an object.
+    min_snr : float
+        Smallest signal to noise at the peak of an object.
     """
-    smooth = point_source_snr(layer)
+    smooth = point_source_snr(measurement)
     top, segments = np.zeros(smooth.shape, np.int32), np.zeros(smooth.shape, np.int32)
     _climb(smooth, np.float32(threshold), top)
     roots, area = np.unique(top[top > 0], return_counts=True)
@@ -48,35 +53,40 @@ def find_peaks(layer: MeasurementImage, threshold: float, min_area: int, min_snr
     return Peaks(segments, height[kept], _touching(segments, int(kept.sum()))[1:])
 
 
-def point_source_snr(layer: MeasurementImage) -> np.ndarray:
-    """Return the signal to noise (ny, nx), float32, of a point source at every pixel: the matched filter.
+def point_source_snr(measurement: MeasurementImage) -> np.ndarray:
+    """Return the signal to noise of a point source centred on each pixel (matched filter).
 
-    The noise is white but for the factor by which PSF fits scatter more (`Layer.psf_ratio`). Where there is no data
-    there is none.
+    The noise is taken to be white; the result is divided by the factor by which PSF fits scatter more
+    (`MeasurementImage.psf_ratio`).
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), float32
+        0 where there is no data.
     """
-    middle = layer.psf.shape[0] // 2
-    part = slice(middle - KERNEL, middle + KERNEL + 1)
-    kernel = np.ascontiguousarray(layer.psf[part, part], np.float32)
-    good = ~layer.mask
-    weight = np.zeros(layer.image.shape, np.float32)
-    np.divide(1, layer.error**2, out=weight, where=good & (layer.error > 0))
+    middle = measurement.psf.shape[0] // 2
+    part = slice(middle - KERNEL_HALF_WIDTH, middle + KERNEL_HALF_WIDTH + 1)
+    kernel = np.ascontiguousarray(measurement.psf[part, part], np.float32)
+    good = ~measurement.mask
+    weight = np.zeros(measurement.image.shape, np.float32)
+    np.divide(1, measurement.error**2, out=weight, where=good & (measurement.error > 0))
     scale = np.float32(weight.max(initial=0))
     if not scale > 0:
         return weight
     weight /= scale
-    turned = kernel[::-1, ::-1]
-    sums = convolve(layer.image * weight, turned)
-    norm = convolve(weight, turned**2)
-    found = np.zeros(weight.shape, np.float32)
-    # of what is mostly beyond the edge nothing is said
+    flipped = kernel[::-1, ::-1]
+    sums = convolve(measurement.image * weight, flipped)
+    norm = convolve(weight, flipped**2)
+    snr = np.zeros(weight.shape, np.float32)
+    # no result where most of the kernel has no data
     enough = good & (norm > 0.2 * (kernel**2).sum() * weight)
-    np.divide(sums, np.sqrt(np.maximum(norm, 1e-12)), out=found, where=enough)
-    return found * np.float32(np.sqrt(scale) / layer.psf_ratio)
+    np.divide(sums, np.sqrt(np.maximum(norm, 1e-12)), out=snr, where=enough)
+    return snr * np.float32(np.sqrt(scale) / measurement.psf_ratio)
 
 
 @numba.njit(nogil=True, cache=True)
 def _climb(image, threshold, top):
-    """Give every pixel above the threshold the number (from 1, in the flattened image) of the peak above it."""
+    """Write, for each pixel above the threshold, 1 + the index in the flattened image of the peak uphill of it."""
     ny, nx = image.shape
     path = np.empty(ny + nx, np.int64)
     for y in range(ny):
@@ -85,7 +95,7 @@ def _climb(image, threshold, top):
                 continue
             v, u, steps = y, x, 0
             while top[v, u] == 0:
-                # pixels on the way; a longer one is finished in more than one go
+                # record the path; pixels beyond the length of the buffer are left to later climbs
                 if steps < len(path):
                     path[steps] = v * nx + u
                     steps += 1
@@ -104,6 +114,7 @@ def _climb(image, threshold, top):
 
 @numba.njit(nogil=True, cache=True)
 def _touching(segments, count):
+    """Return, for each number in the map, whether its pixels are next to pixels of another number."""
     out = np.zeros(count + 1, np.bool_)
     ny, nx = segments.shape
     for y in range(ny):

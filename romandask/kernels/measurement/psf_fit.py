@@ -1,4 +1,4 @@
-"""Fits of the PSF to an image at many places: fluxes of point sources, and how they scatter in noise."""
+"""Fits of the PSF to an image at many positions: fluxes of point sources, and their scatter in noise."""
 
 from __future__ import annotations
 
@@ -6,83 +6,111 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from romandask.kernels.measurement.measurement_image import TRIALS, at
+from romandask.kernels.measurement.measurement_image import TRIALS, pixel_values
 
-RADIUS = 12
-"""Half the side of the window of a fit, pixels."""
-_REACH = 3
-"""Half the width of the quintic B-spline between whose coefficients the PSF is interpolated, pixels."""
+WINDOW_HALF_WIDTH = 12
+"""Half the width of the window of a fit, pixels."""
+_SPLINE_HALF_WIDTH = 3
+"""Half the width of the quintic B-spline with which the PSF is interpolated, pixels."""
 
 
 def fit(image: np.ndarray, psf: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return sum(P d) / sum(P^2) and sum(P^2), both (n,), with the PSF shifted to each position by a quintic spline.
+    """Fit the flux of the PSF, without weights, to an image at some positions.
 
-    NaN and 0 where the window does not lie in the image; beyond its own image the PSF is 0.
+    The PSF P is shifted to each position with a quintic spline; beyond its own image it is 0.
 
     Parameters
     ----------
-    image : (ny, nx)
-    psf : (side, side) unit star in the middle
-    x, y : (n,) pixels
+    image : ndarray, shape (ny, nx)
+        The data d.
+    psf : ndarray, shape (side, side)
+        PSF of unit flux, centred on the middle of the image.
+    x, y : ndarray, shape (n,), pixels
+
+    Returns
+    -------
+    flux : ndarray, shape (n,)
+        sum(P d) / sum(P^2) over the window; NaN where the window is not inside the image.
+    norm : ndarray, shape (n,)
+        sum(P^2); 0 where the window is not inside the image.
     """
     coefficients = ndimage.spline_filter(np.asarray(psf, float), order=5)
-    padded = np.pad(np.pad(coefficients, _REACH, mode="reflect"), RADIUS + _REACH)
+    padded = np.pad(np.pad(coefficients, _SPLINE_HALF_WIDTH, mode="reflect"), WINDOW_HALF_WIDTH + _SPLINE_HALF_WIDTH)
     return _fit(image, padded, len(psf), np.asarray(x, float), np.asarray(y, float))
 
 
 def scatter(noise: np.ndarray, psf: np.ndarray, error: np.ndarray) -> float:
-    """Return how much larger the scatter of PSF fits to a noise realisation is than that of white noise.
+    """Return the scatter of fluxes from PSF fits to a noise realisation over that in white noise.
 
-    `error` (ny, nx) is the rms of a pixel, 0 for no data.
+    Parameters
+    ----------
+    noise : ndarray, shape (ny, nx)
+        Noise realisation.
+    psf : ndarray, shape (side, side)
+    error : ndarray, shape (ny, nx)
+        Rms of a pixel; 0 for no data.
+
+    Returns
+    -------
+    float
+        1 if there are too few pixels with data.
     """
     random = np.random.default_rng(0)
     ny, nx = noise.shape
-    x, y = (random.uniform(RADIUS, n - 1 - RADIUS, TRIALS) for n in (nx, ny))
+    x, y = (random.uniform(WINDOW_HALF_WIDTH, n - 1 - WINDOW_HALF_WIDTH, TRIALS) for n in (nx, ny))
     trial, norm = fit(noise, psf, x, y)
-    pixel = at(error, x, y)
-    good = (pixel > 0) & (norm > 0)
-    return float(np.std(trial[good] * np.sqrt(norm[good]) / pixel[good])) if good.sum() > 50 else 1.0
+    rms = pixel_values(error, x, y)
+    good = (rms > 0) & (norm > 0)
+    return float(np.std(trial[good] * np.sqrt(norm[good]) / rms[good])) if good.sum() > 50 else 1.0
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _fit(image, coefficients, side, x, y):
-    """`coefficients` are those of a PSF of `side` pixels, with room around them for a window that reaches beyond it."""
-    width, room = 2 * RADIUS + 1, RADIUS + 2 * _REACH
+    """Fit a PSF of `side` pixels, given its spline coefficients, padded for windows that extend beyond the PSF."""
+    width, padding = 2 * WINDOW_HALF_WIDTH + 1, WINDOW_HALF_WIDTH + 2 * _SPLINE_HALF_WIDTH
     flux, norm = np.full(len(x), np.nan), np.zeros(len(x))
-    rows = np.empty((width + 2 * _REACH - 1, width))
-    wx, wy = np.empty(2 * _REACH), np.empty(2 * _REACH)
+    rows = np.empty((width + 2 * _SPLINE_HALF_WIDTH - 1, width))
+    wx, wy = np.empty(2 * _SPLINE_HALF_WIDTH), np.empty(2 * _SPLINE_HALF_WIDTH)
     ny, nx = image.shape
     middle = (side - 1) / 2
     for n in range(len(x)):
         if not (np.isfinite(x[n]) and np.isfinite(y[n])):
             continue
         ix, iy = int(np.rint(x[n])), int(np.rint(y[n]))
-        if ix < RADIUS or iy < RADIUS or ix >= nx - RADIUS or iy >= ny - RADIUS:
+        if (
+            ix < WINDOW_HALF_WIDTH
+            or iy < WINDOW_HALF_WIDTH
+            or ix >= nx - WINDOW_HALF_WIDTH
+            or iy >= ny - WINDOW_HALF_WIDTH
+        ):
             continue
-        # of every pixel of the window the place on the PSF has the same fraction
+        # the position on the PSF has the same fractional part for all pixels of the window
         u, v = middle + ix - x[n], middle + iy - y[n]
         left, low = int(np.floor(u)), int(np.floor(v))
         _spline(u - left, wx)
         _spline(v - low, wy)
-        first_column, first_row = left - RADIUS - _REACH + 1 + room, low - RADIUS - _REACH + 1 + room
+        first_column, first_row = (
+            left - WINDOW_HALF_WIDTH - _SPLINE_HALF_WIDTH + 1 + padding,
+            low - WINDOW_HALF_WIDTH - _SPLINE_HALF_WIDTH + 1 + padding,
+        )
         for j in range(rows.shape[0]):
             for i in range(width):
                 value = 0.0
-                for k in range(2 * _REACH):
+                for k in range(2 * _SPLINE_HALF_WIDTH):
                     value += wx[k] * coefficients[first_row + j, first_column + i + k]
                 rows[j, i] = value
         total, square = 0.0, 0.0
         for j in range(width):
-            if not 0 <= v + j - RADIUS <= side - 1:
+            if not 0 <= v + j - WINDOW_HALF_WIDTH <= side - 1:
                 continue
             for i in range(width):
-                if not 0 <= u + i - RADIUS <= side - 1:
+                if not 0 <= u + i - WINDOW_HALF_WIDTH <= side - 1:
                     continue
                 model = 0.0
-                for k in range(2 * _REACH):
+                for k in range(2 * _SPLINE_HALF_WIDTH):
                     model += wy[k] * rows[j + k, i]
                 square += model * model
-                total += model * image[iy + j - RADIUS, ix + i - RADIUS]
+                total += model * image[iy + j - WINDOW_HALF_WIDTH, ix + i - WINDOW_HALF_WIDTH]
         norm[n] = square
         if square > 0:
             flux[n] = total / square
@@ -91,7 +119,7 @@ def _fit(image, coefficients, side, x, y):
 
 @numba.njit(nogil=True, cache=True)
 def _spline(fraction, weights):
-    """Fill `weights` with those of the six coefficients around a place, `fraction` of a pixel right of the third."""
+    """Write the weights of the six spline coefficients around a position `fraction` of a pixel right of the third."""
     for k in range(6):
         d = abs(fraction + 2 - k)
         if d < 1:

@@ -10,7 +10,7 @@ import pandas as pd
 from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.kernels.measurement.extract import (
     SATURATED_CORE,
-    Found,
+    DetectedObjects,
     aperture_fluxes,
     detect,
     detect_peaks,
@@ -124,7 +124,7 @@ def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: R
 
 
 def measure(
-    found: Found,
+    found: DetectedObjects,
     ra: np.ndarray,
     dec: np.ndarray,
     tile: Tile,

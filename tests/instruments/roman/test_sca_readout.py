@@ -16,7 +16,14 @@ from romandask.instruments.instrument import Exposure
 from romandask.instruments.roman.sca_effects import differences
 from romandask.instruments.roman.sca_readout import DAY, age, before
 from romandask.kernels.detectors.sca import MEMORY
-from romandask.kernels.detectors.sca_exposure import COSMIC_RAY_FLAG, FLAGS, LEAST, Trapped, afterglow, trap
+from romandask.kernels.detectors.sca_exposure import (
+    COSMIC_RAY_FLAG,
+    FLAGS,
+    MIN_TRAPPED_CHARGE,
+    Trapped,
+    afterglow,
+    trap,
+)
 from romandask.kernels.detectors.simple_detector import PERSISTENCE, usable
 from romandask.kernels.detectors.synthetic_sca import released_charge
 from romandask.model.seeds import rng
@@ -74,7 +81,7 @@ def test_traps_hold_the_formula_of_bright_pixels_alone():
     np.testing.assert_allclose(found.charge[:3], expected, rtol=1e-5)
     # clipped at the well: between 1e5 and 3e5
     np.testing.assert_allclose(found.charge[3], at[4, 3] + 0.05 * (at[5, 3] - at[4, 3]), rtol=1e-5)
-    assert (found.charge >= LEAST).all()
+    assert (found.charge >= MIN_TRAPPED_CHARGE).all()
     twice = Trapped(np.array([0, 4088], np.int32), np.array([3.0, 5.0], np.float32))
     current = afterglow([(twice, 100.0), (found, 200.0), (twice, 400.0)])
     assert current[0, 0] == pytest.approx(3 / 100 + 3 / 400)

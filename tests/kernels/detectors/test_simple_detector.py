@@ -1,3 +1,5 @@
+"""The simple detector model: moments of the noise, saturation and reproducibility."""
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def test_noise_has_the_moments_of_poisson_and_read_noise():
     assert image.mean() == pytest.approx(150.0, abs=0.15)
     assert image.var() == pytest.approx(150.0 + 8.5**2 + 1 / 12, rel=0.01)
     residual = image - image.mean()
-    assert np.abs(np.mean(residual[:, 1:] * residual[:, :-1])) < 2.0, "neighbours are independent"
+    assert np.abs(np.mean(residual[:, 1:] * residual[:, :-1])) < 2.0, "neighbours are correlated"
 
 
 def test_bright_pixels_are_clipped_and_flagged():
@@ -27,7 +29,7 @@ def test_bright_pixels_are_clipped_and_flagged():
     assert (dq > 0).sum() == 1
 
 
-def test_the_ringing_below_zero_of_the_expectation_does_no_harm():
+def test_negative_expected_values_give_a_finite_image():
     image, _ = observe(np.full((20, 20), -5.0, np.float32), np.float32(1.0), DETECTOR, rng(3, "t"))
     assert np.isfinite(image).all()
 
@@ -37,7 +39,7 @@ def test_the_same_seed_gives_the_same_image():
     np.testing.assert_array_equal(*pair)
 
 
-def test_a_noise_realisation_does_not_depend_on_the_part_asked_for():
+def test_a_noise_realisation_does_not_depend_on_the_requested_part():
     def part(rows, columns):
         shape = (rows.stop - rows.start, columns.stop - columns.start)
         return noise_realisation(np.full(shape, 100 + 8.5**2, np.float32), 400, rows, columns, lambda k: rng(5, "n", k))

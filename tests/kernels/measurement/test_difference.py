@@ -1,4 +1,4 @@
-"""Images matched in their PSFs and subtracted: against images that GalSim draws with both PSFs."""
+"""Image differences, tested with images that GalSim draws with a sharp and a blunt PSF."""
 
 import galsim
 import numpy as np
@@ -24,17 +24,18 @@ BLUNT = galsim.Kolmogorov(fwhm=0.7)
 
 
 def psf_image(psf: galsim.GSObject, scale: float, side: int) -> np.ndarray:
+    """Return a PSF of unit flux, (side, side), integrated over pixels of `scale` arcsec."""
     return galsim.Convolve(psf, galsim.Pixel(scale)).drawImage(nx=side, ny=side, scale=scale, method="no_pixel").array
 
 
 def field(psf, side, scale, sources, shift=(0.0, 0.0)):
-    """Return GalSim's image of some sources (arcsec from the middle, flux, half-light radius or 0)."""
+    """Draw sources with GalSim: each (x and y from the middle in arcsec, flux, half-light radius in arcsec or 0)."""
     image = galsim.ImageF(side, side, scale=scale)
     for x, y, flux, radius in sources:
         profile = galsim.DeltaFunction() if radius == 0 else galsim.Exponential(half_light_radius=radius)
-        seen = galsim.Convolve(profile, psf) * flux
-        place = galsim.PositionD((x + shift[0]) / scale + (side + 1) / 2, (y + shift[1]) / scale + (side + 1) / 2)
-        seen.drawImage(image, center=place, add_to_image=True)
+        convolved = galsim.Convolve(profile, psf) * flux
+        centre = galsim.PositionD((x + shift[0]) / scale + (side + 1) / 2, (y + shift[1]) / scale + (side + 1) / 2)
+        convolved.drawImage(image, center=centre, add_to_image=True)
     return image.array
 
 
@@ -47,10 +48,10 @@ def sources(count: int = 60) -> list[tuple[float, float, float, float]]:
 
 @pytest.fixture(scope="module")
 def pair():
-    """A template on the coarse grid, blurred by models of the PSFs, and the image that GalSim draws there."""
-    every = sources()
+    """Sources, a template blurred with the PSF models onto the coarse grid, and the image that GalSim draws there."""
+    catalog = sources()
     side = int(SIDE * COARSE / FINE) + 60
-    fine = field(SHARP, side, FINE, every)
+    fine = field(SHARP, side, FINE, catalog)
     kernel = matching_kernel(psf_image(SHARP, FINE, 105), FINE, psf_image(BLUNT, COARSE, 61), COARSE)
     onto = pixel_map(
         WCS(tangent_header(53.0, -40.0, SIDE, COARSE)),
@@ -59,69 +60,72 @@ def pair():
         slice(0, SIDE),
     )
     template = blurred(lambda rows, columns: fine[rows, columns], fine.shape, kernel, onto, (COARSE / FINE) ** 2)
-    return every, template, field(BLUNT, SIDE, COARSE, every)
+    return catalog, template, field(BLUNT, SIDE, COARSE, catalog)
 
 
-def pixels(every) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(np.array([source[k] for source in every]) / COARSE + (SIDE - 1) / 2 for k in (0, 1))
+def pixels(catalog) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y of the sources in pixels of the coarse grid."""
+    return tuple(np.array([source[k] for source in catalog]) / COARSE + (SIDE - 1) / 2 for k in (0, 1))
 
 
-def test_a_sharp_image_is_blurred_to_the_other(pair):
-    """By the PSFs' models alone: to half a per cent of the brightest pixel of every source."""
-    every, template, image = pair
-    for x, y in zip(*pixels(every), strict=True):
+def test_a_sharp_image_is_blurred_to_the_other_psf(pair):
+    """The PSF models alone give an agreement of about half a per cent of the brightest pixel of each source."""
+    catalog, template, image = pair
+    for x, y in zip(*pixels(catalog), strict=True):
         part = slice(int(y) - 6, int(y) + 8), slice(int(x) - 6, int(x) + 8)
         assert np.abs(template - image)[part].max() < 0.006 * image[part].max()
     assert template.sum() == pytest.approx(image.sum(), rel=5e-3)
 
 
-def test_the_difference_is_noise_and_what_is_new_keeps_its_flux(pair):
-    """The image has a wider and longer PSF than the models say, its sources other fluxes, and one is new."""
-    every, template, _ = pair
+def test_the_difference_is_noise_and_a_new_source_keeps_its_flux(pair):
+    """The image has a wider and more elongated PSF than the model, sources of other fluxes, and a new source."""
+    catalog, template, _ = pair
     random = rng(9, "noise")
     psf = galsim.Convolve(BLUNT, galsim.Gaussian(sigma=0.12).shear(g1=0.2))
-    coloured = [(x, y, flux * 1.1 * (1 + 0.05 * random.standard_normal()), radius) for x, y, flux, radius in every]
-    alone = field(psf, SIDE, COARSE, coloured)
-    # where no other is near, of whose colour something is left
-    places = rng(9, "places").uniform(-16, 16, (400, 2))
-    apart = np.hypot(*(places[:, k, None] - np.array([source[k] for source in every]) for k in (0, 1)))
-    new = (*places[np.argmax(apart.min(axis=1))], 5000.0, 0.0)
+    coloured = [(x, y, flux * 1.1 * (1 + 0.05 * random.standard_normal()), radius) for x, y, flux, radius in catalog]
+    without_new = field(psf, SIDE, COARSE, coloured)
+    # a position far from the other sources, whose changes in flux leave residuals
+    positions = rng(9, "places").uniform(-16, 16, (400, 2))
+    distance = np.hypot(*(positions[:, k, None] - np.array([source[k] for source in catalog]) for k in (0, 1)))
+    new = (*positions[np.argmax(distance.min(axis=1))], 5000.0, 0.0)
     noise = 1.5
-    image = alone + field(psf, SIDE, COARSE, [new]) + random.normal(20, noise, alone.shape).astype(np.float32)
+    image = (
+        without_new + field(psf, SIDE, COARSE, [new]) + random.normal(20, noise, without_new.shape).astype(np.float32)
+    )
     error = np.full(image.shape, noise, np.float32)
-    found = match(image, template, error, *pixels(every))
-    matched = found.image(template)
-    left = image - matched - found.sky()
-    assert np.median(left) == pytest.approx(0, abs=0.1)
-    fit = dipoles(left, matched, error, *pixels(every))
-    fluxes = np.array([source[2] for source in every])
-    # colours of five per cent are left, shifts are not
-    assert np.std(fit[:, 0][fluxes > 3000]) == pytest.approx(0.05, rel=0.4)
-    assert np.abs(np.nanmedian(fit[:, 1:3], axis=0)).max() < 0.01
-    assert np.nanmedian(np.hypot(fit[:, 1], fit[:, 2])[fluxes > 3000]) < 0.03
+    fit = match(image, template, error, *pixels(catalog))
+    matched = fit.image(template)
+    difference = image - matched - fit.sky()
+    assert np.median(difference) == pytest.approx(0, abs=0.1)
+    residuals = dipoles(difference, matched, error, *pixels(catalog))
+    fluxes = np.array([source[2] for source in catalog])
+    # differences in flux of 5% remain, shifts do not
+    assert np.std(residuals[:, 0][fluxes > 3000]) == pytest.approx(0.05, rel=0.4)
+    assert np.abs(np.nanmedian(residuals[:, 1:3], axis=0)).max() < 0.01
+    assert np.nanmedian(np.hypot(residuals[:, 1], residuals[:, 2])[fluxes > 3000]) < 0.03
     x, y = ((value / COARSE) + (SIDE - 1) / 2 for value in new[:2])
     v, u = np.mgrid[:SIDE, :SIDE]
     aperture = np.hypot(v - y, u - x) < 12
     light = psf_image(psf, COARSE, 61)
     w, t = np.mgrid[:61, :61] - 30
     share = light[np.hypot(w, t) < 12].sum()
-    flux = left[aperture].sum() / share
+    flux = difference[aperture].sum() / share
     assert flux == pytest.approx(new[2], abs=4 * noise * np.sqrt(aperture.sum()) + 0.03 * new[2])
 
 
-def test_a_shift_between_the_images_shows_as_dipoles(pair):
-    """No kernel takes it up: a tenth of a pixel is found as a tenth of a pixel."""
-    every, template, _ = pair
-    image = field(BLUNT, SIDE, COARSE, every, shift=(0.3 * COARSE, -0.1 * COARSE))
+def test_a_shift_between_the_images_is_measured_from_dipoles(pair):
+    """The matching kernel does not absorb a shift: it is recovered to 0.03 pixels."""
+    catalog, template, _ = pair
+    image = field(BLUNT, SIDE, COARSE, catalog, shift=(0.3 * COARSE, -0.1 * COARSE))
     error = np.full(image.shape, 0.5, np.float32)
-    found = match(image, template, error, *pixels(every))
-    matched = found.image(template)
-    fit = dipoles(image - matched - found.sky(), matched, error, *pixels(every))
-    assert np.nanmedian(fit[:, 1]) == pytest.approx(0.3, abs=0.03)
-    assert np.nanmedian(fit[:, 2]) == pytest.approx(-0.1, abs=0.03)
+    fit = match(image, template, error, *pixels(catalog))
+    matched = fit.image(template)
+    residuals = dipoles(image - matched - fit.sky(), matched, error, *pixels(catalog))
+    assert np.nanmedian(residuals[:, 1]) == pytest.approx(0.3, abs=0.03)
+    assert np.nanmedian(residuals[:, 2]) == pytest.approx(-0.1, abs=0.03)
 
 
-def test_surfaces_are_the_sums_of_their_polynomials():
+def test_a_surface_is_the_sum_of_its_polynomial_terms():
     values = rng(1, "values").normal(size=6)
     y, x = np.mgrid[:30, :40]
     expected = np.tensordot(values, polynomials(y, x, (30, 40)), 1)

@@ -1,4 +1,4 @@
-"""Detection and photometry of one image: Source Extractor itself, and brute force, are the references."""
+"""Detection and photometry of one image, compared with Source Extractor, NumPy and SciPy."""
 
 import shutil
 import subprocess
@@ -16,7 +16,7 @@ from romandask.kernels.measurement import psf_fit
 from romandask.kernels.measurement.extract import (
     FLAGS,
     NOT_DEBLENDED,
-    Found,
+    DetectedObjects,
     detect,
     ellipse_flux,
     kron_fluxes,
@@ -35,7 +35,7 @@ SIDE, SEXTRACTOR = 1000, Path("/usr/share/source-extractor")
 
 
 def field(seed: int = 3, count: int = 900) -> np.ndarray:
-    """Return an image (SIDE, SIDE) of galaxies, exponential and seen through a Gaussian, without noise."""
+    """Return a noiseless image (SIDE, SIDE) of exponential galaxies convolved with a Gaussian PSF."""
     random = np.random.default_rng(seed)
     image = np.zeros((SIDE, SIDE), np.float32)
     offset = np.arange(-30, 31)
@@ -51,21 +51,27 @@ def field(seed: int = 3, count: int = 900) -> np.ndarray:
     return ndimage.gaussian_filter(image, 1.3)
 
 
-def layer_of(image: np.ndarray, noise: np.ndarray, weight: np.ndarray) -> MeasurementImage:
+def measurement_of(image: np.ndarray, noise: np.ndarray, weight: np.ndarray) -> MeasurementImage:
     error, mask = errors(weight.astype(np.float32), rms_of(noise, weight))
     psf = np.zeros((41, 41), np.float32)
     psf[20, 20] = 1
-    return MeasurementImage(image, error, mask, noise_ratios(noise, error, mask), ndimage.gaussian_filter(psf, 1.3))
+    return MeasurementImage(
+        image=image,
+        error=error,
+        mask=mask,
+        aperture_ratios=noise_ratios(noise, error, mask),
+        psf=ndimage.gaussian_filter(psf, 1.3),
+    )
 
 
 @pytest.fixture(scope="module")
 def noisy() -> MeasurementImage:
     random = np.random.default_rng(1)
     image = field() + random.normal(0, 1, (SIDE, SIDE)).astype(np.float32)
-    return layer_of(image, random.normal(0, 1, (SIDE, SIDE)).astype(np.float32), np.ones((SIDE, SIDE)))
+    return measurement_of(image, random.normal(0, 1, (SIDE, SIDE)).astype(np.float32), np.ones((SIDE, SIDE)))
 
 
-def test_source_extractor_finds_the_same_objects_as_bright(noisy, tmp_path):
+def test_objects_and_fluxes_agree_with_source_extractor(noisy, tmp_path):
     program = shutil.which("source-extractor")
     if program is None:
         pytest.fail("Source Extractor is not installed: apt-get install source-extractor")
@@ -103,26 +109,26 @@ def test_source_extractor_finds_the_same_objects_as_bright(noisy, tmp_path):
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    theirs = np.loadtxt(tmp_path / "found.cat")
-    found, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
-    tree = cKDTree(np.c_[found.x, found.y])
-    # ours is under a window, or, where that wanders off, the barycentre
-    queries = [tree.query(theirs[:, columns] - 1) for columns in ([0, 1], [2, 3])]
+    sextractor = np.loadtxt(tmp_path / "found.cat")
+    objects, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
+    tree = cKDTree(np.c_[objects.x, objects.y])
+    # x and y are windowed positions, or barycentres where the window moves away
+    queries = [tree.query(sextractor[:, columns] - 1) for columns in ([0, 1], [2, 3])]
     distance = np.min([distances for distances, _ in queries], axis=0)
     nearest = np.where(queries[0][0] < queries[1][0], queries[0][1], queries[1][1])
-    assert len(theirs) > 500
+    assert len(sextractor) > 500
     assert (distance < 1).mean() > 0.98
-    assert len(found.x) == pytest.approx(len(theirs), rel=0.02)
-    flux, _, _ = kron_fluxes(noisy, segments, found)
-    same = (distance < 1) & (theirs[:, 4] > 20 * theirs[:, 5])
-    difference = -2.5 * np.log10(flux[nearest[same]] / theirs[same, 4])
-    assert same.sum() > 200
+    assert len(objects.x) == pytest.approx(len(sextractor), rel=0.02)
+    flux, _, _ = kron_fluxes(noisy, segments, objects)
+    matched = (distance < 1) & (sextractor[:, 4] > 20 * sextractor[:, 5])
+    difference = -2.5 * np.log10(flux[nearest[matched]] / sextractor[matched, 4])
+    assert matched.sum() > 200
     assert abs(np.median(difference)) < 0.001
     assert (np.abs(difference) < 0.02).mean() > 0.99
 
 
-def test_quoted_errors_are_the_scatter_on_correlated_noise():
-    """The noise of a drizzled image is smooth: white noise of the same pixels would say half of it."""
+def test_errors_agree_with_the_scatter_in_correlated_noise():
+    """The noise of a drizzled image is smooth: errors for white noise of the same rms would be half as large."""
     random = np.random.default_rng(5)
     noise, other = (
         ndimage.gaussian_filter(random.normal(0, 1, (SIDE, SIDE)), 0.8).astype(np.float32) for _ in range(2)
@@ -130,51 +136,53 @@ def test_quoted_errors_are_the_scatter_on_correlated_noise():
     weight = np.ones((SIDE, SIDE))
     weight[:, : SIDE // 2] = 2.0
     noise, other = (np.asarray(plane / np.sqrt(weight), np.float32) for plane in (noise, other))
-    layer = layer_of(other, noise, weight)
-    layer = replace(layer, psf_ratio=psf_fit.scatter(noise, layer.psf, layer.error))
+    measurement = measurement_of(other, noise, weight)
+    measurement = replace(measurement, psf_ratio=psf_fit.scatter(noise, measurement.psf, measurement.error))
     x, y = random.uniform(40, SIDE - 40, (2, 3000))
     for radius in (2.0, 5.0, 11.0):
-        ones, nowhere = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)
-        flux, error, _ = ellipse_flux(layer, nowhere, ones.astype(int), x, y, ones, ones, 0 * ones, radius * ones)
+        ones, no_segments = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)
+        flux, error, _ = ellipse_flux(
+            measurement, no_segments, ones.astype(int), x, y, ones, ones, 0 * ones, radius * ones
+        )
         assert np.std(flux / error) == pytest.approx(1, abs=0.1)
-    unused = {name: np.zeros(len(x)) for name in Found.__dataclass_fields__ if name not in ("x", "y")}
-    flux, error = psf_fluxes(layer, Found(x=x, y=y, **unused))
+    unused = {name: np.zeros(len(x)) for name in DetectedObjects.__dataclass_fields__ if name not in ("x", "y")}
+    flux, error = psf_fluxes(measurement, DetectedObjects(x=x, y=y, **unused))
     assert np.std(flux / error) == pytest.approx(1, abs=0.1)
 
 
-def test_the_map_has_the_objects_and_an_overflow_is_flagged(noisy, monkeypatch):
-    found, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
-    ix, iy = np.rint(found.x).astype(int), np.rint(found.y).astype(int)
-    assert (segments[iy, ix] == found.label).mean() > 0.9
-    assert set(np.unique(segments)) == {0, *found.label}
-    whole = sep.extract
+def test_the_segmentation_map_has_the_objects_and_a_deblending_overflow_is_flagged(noisy, monkeypatch):
+    objects, segments = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
+    ix, iy = np.rint(objects.x).astype(int), np.rint(objects.y).astype(int)
+    assert (segments[iy, ix] == objects.label).mean() > 0.9
+    assert set(np.unique(segments)) == {0, *objects.label}
+    extract = sep.extract
 
     def crowded(*arguments, deblend_cont, **named):
         if deblend_cont < 1:
             raise Exception("object deblending overflow")
-        return whole(*arguments, deblend_cont=deblend_cont, **named)
+        return extract(*arguments, deblend_cont=deblend_cont, **named)
 
     monkeypatch.setattr(sep, "extract", crowded)
     flagged, _ = detect(noisy, 2.5, 5, 48, 0.05, 0.0)
     assert (flagged.flags & NOT_DEBLENDED > 0).all()
     assert FLAGS["not_deblended"] == NOT_DEBLENDED
-    assert 0.7 * len(found.x) < len(flagged.x) <= len(found.x)
+    assert 0.7 * len(objects.x) < len(flagged.x) <= len(objects.x)
 
 
 @pytest.mark.parametrize("bands", [1, 2, 3, 4, 5, 6])
-def test_the_median_is_numpys_of_the_bands_with_data(bands):
+def test_the_median_agrees_with_numpy_for_the_bands_with_data(bands):
     random = np.random.default_rng(bands)
     planes = random.normal(size=(bands, 60, 70)).astype(np.float32)
     weights = random.uniform(0.5, 1, planes.shape).astype(np.float32)
     weights[random.random(planes.shape) < 0.3] = 0
-    found = median(list(planes), list(weights))
-    some = (weights > 0).any(axis=0)
-    expected = np.nanmedian(np.where(weights > 0, planes, np.nan)[:, some], axis=0)
-    np.testing.assert_allclose(found[some], expected, atol=1e-6)
-    assert not found[~some].any()
+    medians = median(list(planes), list(weights))
+    has_data = (weights > 0).any(axis=0)
+    expected = np.nanmedian(np.where(weights > 0, planes, np.nan)[:, has_data], axis=0)
+    np.testing.assert_allclose(medians[has_data], expected, atol=1e-6)
+    assert not medians[~has_data].any()
 
 
-def test_the_mean_weighs_bands_by_their_variance():
+def test_the_mean_weights_bands_by_inverse_variance():
     planes = [np.full((3, 4), value, np.float32) for value in (1.0, 3.0)]
     weights = [np.full((3, 4), 2.0, np.float32), np.full((3, 4), 5.0, np.float32)]
     weights[1][0] = 0
@@ -185,7 +193,7 @@ def test_the_mean_weighs_bands_by_their_variance():
 
 
 @pytest.mark.parametrize("side", [71, 25, 9])
-def test_psf_fits_are_those_of_scipys_spline(side):
+def test_psf_fits_agree_with_scipys_spline(side):
     random = np.random.default_rng(5)
     offset = np.arange(side) - (side - 1) / 2
     psf = np.exp(-(offset[:, None] ** 2 + offset**2) / 6) + 0.01 * random.random((side, side))
@@ -202,8 +210,8 @@ def test_psf_fits_are_those_of_scipys_spline(side):
             continue
         inside += 1
         v, u = np.mgrid[-12:13, -12:13]
-        place = [v + (side - 1) / 2 + iy - y[n], u + (side - 1) / 2 + ix - x[n]]
-        model = ndimage.map_coordinates(psf, place, order=5)
+        positions = [v + (side - 1) / 2 + iy - y[n], u + (side - 1) / 2 + ix - x[n]]
+        model = ndimage.map_coordinates(psf, positions, order=5)
         assert norm[n] == pytest.approx((model**2).sum(), rel=1e-10)
         data = image[iy - 12 : iy + 13, ix - 12 : ix + 13]
         assert flux[n] == pytest.approx((model * data).sum() / (model**2).sum(), rel=1e-9, abs=1e-12)

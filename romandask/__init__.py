@@ -12,9 +12,10 @@ from romandask.stages.analysis.blend_statistics import statistics
 from romandask.stages.analysis.friends_of_friends import matches
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.cutouts import cutouts
-from romandask.stages.detections.detections import detections
+from romandask.stages.detections.detections import detect_and_measure, detections
+from romandask.stages.detections.field import ArrayField
 from romandask.stages.detections.objects import objects
-from romandask.stages.exposures import exposures
+from romandask.stages.exposures.exposures import exposures
 from romandask.stages.pointings import pointings
 from romandask.stages.psf_images import psfs
 from romandask.stages.truth.catalogs import truth
@@ -27,6 +28,7 @@ __version__ = _version("romandask")
 threadpool_limits(limits=1, user_api="blas")
 
 __all__ = [
+    "ArrayField",
     "Cone",
     "Pipeline",
     "Region",
@@ -34,6 +36,7 @@ __all__ = [
     "UserError",
     "coadds",
     "cutouts",
+    "detect_and_measure",
     "detections",
     "exposures",
     "load_pipeline",

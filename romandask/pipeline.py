@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 from pydantic import Field, model_validator
 
-from romandask.instruments.instrument import Instrument
-from romandask.instruments.roman.calibration_source import CalibrationSource
-from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.instruments.instrument import Instrument, InstrumentContext, InstrumentSettings
+from romandask.instruments.roman.roman import RomanSettings
+from romandask.instruments.rubin.rubin import RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.model.settings import (
@@ -29,7 +28,7 @@ from romandask.model.settings import (
     read_yaml,
     validate,
 )
-from romandask.storage.paths import AnyPath, access_errors_explained, parse_path, resolve_below
+from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 
 
 class Pipeline(Section):
@@ -42,6 +41,7 @@ class Pipeline(Section):
     region: RegionSettings
     truth: TruthSettings = TruthSettings()
     render: RenderSettings = RenderSettings()
+    # instruments, in the order in which their products are made: a new telescope is one line here
     roman: RomanSettings | None = None
     rubin: RubinSettings | None = None
     coadds: CoaddSettings = CoaddSettings()
@@ -53,35 +53,52 @@ class Pipeline(Section):
 
     @model_validator(mode="after")
     def _has_survey(self) -> Pipeline:
-        if self.roman is None and self.rubin is None:
-            raise ValueError("sections roman and rubin are both left out: a survey has one of them, or both")
+        if not self.blocks():
+            names = " and ".join(self.instrument_types())
+            raise ValueError(f"sections {names} are both left out: a survey has one of them, or both")
         return self
+
+    @model_validator(mode="after")
+    def _has_bands_of_differences(self) -> Pipeline:
+        known = [band for kind in self.instrument_types().values() for band in kind.every_band]
+        for key in ("template", "science"):
+            if (band := getattr(self.differences, key)) not in known:
+                raise ValueError(f"differences.{key}: Input should be one of {', '.join(known)} (found {band!r})")
+        return self
+
+    @classmethod
+    def instrument_types(cls) -> dict[str, type[InstrumentSettings]]:
+        """Return the settings classes of all instruments that a pipeline may have, by name."""
+        return {
+            name: kind
+            for name, info in cls.model_fields.items()
+            for kind in get_args(info.annotation)
+            if isinstance(kind, type) and issubclass(kind, InstrumentSettings)
+        }
+
+    def blocks(self) -> dict[str, InstrumentSettings]:
+        """Return the blocks of the instruments of this survey by name, in order."""
+        blocks = {name: getattr(self, name) for name in self.instrument_types()}
+        return {name: block for name, block in blocks.items() if block is not None}
+
+    def block(self, survey: str) -> InstrumentSettings:
+        """Return the block of an instrument."""
+        return self.blocks()[survey]
 
     def instruments(self) -> dict[str, Instrument]:
         """Return the instruments of this survey by name, in order."""
-        found: dict[str, Instrument] = {}
-        if self.roman is not None:
-            found["roman"] = Roman(self.roman, self.render.n_waves, self.calibration())
-        if self.rubin is not None:
-            found["rubin"] = Rubin(self.rubin, self.render.n_waves, seed=self.seed)
-        return found
-
-    def block(self, survey: str) -> RomanSettings | RubinSettings:
-        """Return the block of an instrument."""
-        found: RomanSettings | RubinSettings | None = {"roman": self.roman, "rubin": self.rubin}[survey]
-        assert found is not None
-        return found
-
-    def calibration(self) -> CalibrationSource | None:
-        """Return where the calibrations of Roman's SCAs come from; None where they have none."""
-        if self.roman is None or self.roman.detector == "simple":
-            return None
-        folder = self.roman.calibration
-        return CalibrationSource(None if folder is None else resolve_below(parse_path(self.data), folder), self.seed)
+        data = parse_path(self.data, "data")
+        context = InstrumentContext(n_waves=self.render.n_waves, seed=self.seed, data=data)
+        return {name: block.instrument(context) for name, block in self.blocks().items()}
 
     def to_yaml(self) -> str:
         """Return the resolved settings as YAML."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def instrument_types() -> dict[str, type[InstrumentSettings]]:
+    """Return the settings classes of all instruments that a pipeline may have, by name."""
+    return Pipeline.instrument_types()
 
 
 def load_pipeline(source: str | AnyPath, overrides: list[str] | None = None) -> Pipeline:

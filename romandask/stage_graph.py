@@ -19,7 +19,7 @@ from romandask.stages.detections.detections import DETECTIONS
 from romandask.stages.detections.objects import OBJECTS
 from romandask.stages.detections.truth_match import TRUTH_MATCH, TRUTH_SUMMARY
 from romandask.stages.detections.zero_points import ZERO_POINTS
-from romandask.stages.exposures import EXPOSURES
+from romandask.stages.exposures.exposures import EXPOSURES
 from romandask.stages.pointings import POINTINGS
 from romandask.stages.psf_images import PSF_IMAGES
 from romandask.stages.stage import Stage, SurveyContext

@@ -25,7 +25,7 @@ from romandask.stages.analysis.friends_of_friends import group_of, matches_of
 from romandask.stages.analysis.validation import depths, residuals, with_truth
 from romandask.stages.coadds.psf_at import Spectrum, coadd_psf
 from romandask.stages.cutouts import Positions, Wanted, cutouts, located
-from romandask.stages.detections.truth_match import completeness, reference_band
+from romandask.stages.detections.truth_match import completeness
 from romandask.stages.detections.zero_points import FLUXES
 from romandask.stages.pointings import visits
 from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
@@ -127,6 +127,11 @@ class Survey:
             self._shared.clear()
 
     @property
+    def sharpest(self) -> str:
+        """The survey whose coadds have the smallest pixels."""
+        return min(self.instruments, key=lambda name: self.instruments[name].coadd_scale)
+
+    @property
     def truth_catalogs(self) -> TruthCatalogs:
         """The truth catalogs and the spectra that they refer to."""
         return self.once(truth_of)
@@ -174,7 +179,7 @@ class Survey:
         layers: str | Sequence[str] = ("image",),
         bands: str | Sequence[str] | None = None,
         size: int = 48,
-        survey: str = "roman",
+        survey: str | None = None,
         images: Literal["exposures", "coadds"] = "exposures",
         catalog: str = "truth",
     ) -> xr.Dataset:
@@ -193,6 +198,7 @@ class Survey:
         UserError
             If an id is not in the catalog, or a name is not one of the above.
         """
+        survey = self.sharpest if survey is None else survey
         found = located(of, self.tables(catalog), catalog)
         if images not in ("exposures", "coadds"):
             raise UserError(f"{images!r}: this survey has exposures, coadds")
@@ -223,18 +229,19 @@ class Survey:
         scale: float | None = None,
         spectrum: Spectrum | None = None,
     ) -> xr.DataArray:
-        """Return the image of a unit star (v, u) at a place of Roman's coadds: see `stages.coadds.psf_at.coadd_psf`.
+        """Return the image of a unit star (v, u) at a place of drizzled coadds: see `stages.coadds.psf_at.coadd_psf`.
 
         It is as the coadd has it there, or, with a scale, sampled every so many arcsec with the star in the middle.
         """
-        return coadd_psf(self._of("coadds", "roman"), ra, dec, band, stamp, scale, spectrum)
+        survey = next((name for name, one in self.instruments.items() if band in one.bands), self.sharpest)
+        return coadd_psf(self._of("coadds", survey), ra, dec, band, stamp, scale, spectrum)
 
     def segmentation(self, survey: str) -> xr.Dataset:
         """Return the lazy maps of detected objects (tile, y, x): `segmentation`, the last 24 bits of objectId."""
         return self._of("detections", survey).dataset
 
     def differences(self) -> xr.Dataset:
-        """Return the lazy differences (tile, y, x) of Rubin's tiles and Roman's: difference, template, rms, nJy.
+        """Return the lazy differences (tile, y, x) of two surveys' tiles: difference, template, rms, nJy.
 
         Raises
         ------
@@ -257,9 +264,9 @@ class Survey:
         return self._of("truth_summary", survey).frame
 
     def completeness(self, survey: str) -> pd.DataFrame:
-        """Return completeness and purity of a survey's objects by magnitude, in H158 of Roman or i of Rubin."""
+        """Return completeness and purity of a survey's objects by magnitude, in its reference band."""
         summary, matched = (self._of(stage, survey).all_rows() for stage in ("truth_summary", "truth_match"))
-        return completeness(summary, matched, reference_band(self._instrument(survey)))
+        return completeness(summary, matched, self._instrument(survey).reference_band)
 
     def objects_with_truth(self, survey: str) -> pd.DataFrame:
         """Return a survey's objects beside their true counterparts: flux_<band> (nJy), star, redshift, truth_id."""
@@ -326,7 +333,7 @@ class Survey:
         for name, instrument in self.instruments.items():
             if settings.science in instrument.bands:
                 return self.output(f"differences/{name}")
-        raise UserError(f"difference images need {settings.template} of Roman and {settings.science} of Rubin")
+        raise UserError(f"difference images need the bands {settings.template} and {settings.science}")
 
     def _of(self, stage: str, survey: str) -> Any:
         """Return what a stage builds for an instrument."""

@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.stages.exposures import exposures
+from romandask.stages.exposures.exposures import exposures
 from romandask.stages.pointings import CORNERS
 from romandask.stages.truth.catalogs import truth
 

@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 import romandask as rd
 from romandask.export.catalogs import export_truth
 from romandask.ingest.spectra import galaxy_templates
-from romandask.instruments.instrument import exposure_of
+from romandask.instruments.exposure import exposure_of
 from romandask.instruments.rubin.depth import depth_map, visit_depth
 from romandask.kernels.measurement.extract import FLAGS
 from romandask.kernels.universe.galaxies import STEPS, TEMPLATES
 from romandask.model.sky import ARCSEC, unit_vectors
 from romandask.run import run_figures
-from romandask.stages.exposures import wcs_of
+from romandask.stages.exposures.exposures import wcs_of
 from romandask.stages.pointings import corners_of
 from romandask.storage.store import Store
 

@@ -70,13 +70,14 @@ def export_visits(
 def export_fits_images(
     store: StoreArgument,
     out: Folder,
-    survey: Annotated[str, typer.Option("--survey", help="roman or rubin.")] = "roman",
+    survey: Annotated[str | None, typer.Option("--survey", help="Default: the one of the finest pixels.")] = None,
     exposure: Annotated[list[str] | None, typer.Option("--exposure", help="Name; may be repeated.")] = None,
     tile: Annotated[list[str] | None, typer.Option("--tile", help="Name; may be repeated.")] = None,
     band: Annotated[list[str] | None, typer.Option("--band", help="Of tiles; may be repeated; default: all.")] = None,
 ) -> None:
     """Write exposures or tiles as FITS with SCI, ERR and DQ, one file an exposure, or tile and band."""
     found = open_survey(store)
+    survey = found.sharpest if survey is None else survey
     if survey not in found.instruments:
         raise UserError(f"--survey {survey}: this survey has {', '.join(found.instruments)}")
     if not exposure and not tile:

@@ -13,7 +13,7 @@ from romandask.engine.clients import runner
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
 from romandask.model.settings import read_yaml
-from romandask.pipeline import pipeline_of
+from romandask.pipeline import instrument_types, pipeline_of
 from romandask.storage.paths import AnyPath, resolve_below
 from romandask.storage.store import Store
 from romandask.survey import Survey
@@ -88,8 +88,7 @@ def _ingest(
         "seed": 0,
         "region": {"ra": [0, 360], "dec": [-90, 90]},
         "truth": {**truth, "order": order, "seds": str(seds or source.parent / "seds")},
-        "roman": {},
-        "rubin": {},
+        **{name: {} for name in instrument_types()},
     }
     settings = pipeline_of(content, str(source))
     survey = Survey(settings, Store(store))

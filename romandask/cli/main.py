@@ -85,7 +85,8 @@ def plan(
 def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
     """Show what each pixfrac does to the coadds of Roman's dithers, and recommend one; make nothing."""
     with busy("drizzling weights"):
-        found = coverage(Survey(load_pipeline(pipeline, overrides)).output("coadds/roman"))
+        survey = Survey(load_pipeline(pipeline, overrides))
+        found = coverage(survey.output(f"coadds/{survey.sharpest}"))
     table = Table("band", "exposures", "pixfrac", "empty pixels", "rms / median of weight", "")
     for one in found:
         cells = (str(one.exposures), f"{one.pixfrac:.1f}", f"{one.empty:.2%}", f"{one.uneven:.3f}")

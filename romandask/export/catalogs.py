@@ -53,9 +53,9 @@ def export_obseq(survey: Survey, path: Path) -> int:
     Raises
     ------
     UserError
-        If the survey has no Roman, or the file cannot be written.
+        If the file cannot be written.
     """
-    visits = survey.visits("roman")
+    visits = survey.visits(survey.sharpest)
     prepare(path.parent)
     obseq.write(path, visits)
     return len(visits)
@@ -69,11 +69,11 @@ def export_psf(survey: Survey, folder: Path, names: list[str]) -> list[Path]:
     UserError
         If the survey has no such exposure, or the folder cannot be written.
     """
-    product = survey.output("psfs/roman")
+    product = survey.output(f"psfs/{survey.sharpest}")
     indices = indices_of(product, names, "exposure", "this survey")
     prepare(folder)
     attributes = product.variables[0].attributes
-    table = survey.pointings("roman")
+    table = survey.pointings(survey.sharpest)
     written = []
     for name, index in zip(names, indices, strict=True):
         path = folder / f"psf-{name}.fits"
@@ -94,7 +94,8 @@ def export_coadd_psf(
     UserError
         If there is no exposure of a band there, or the folder cannot be written.
     """
-    images = {band: survey.psf(ra, dec, band, scale=scale) for band in bands or survey.instruments["roman"].bands}
+    every = survey.instruments[survey.sharpest].bands
+    images = {band: survey.psf(ra, dec, band, scale=scale) for band in bands or every}
     prepare(path)
     written = []
     for band, image in images.items():
@@ -114,17 +115,17 @@ def export_meds(survey: Survey, folder: Path, of: Wanted, bands: list[str], size
         If objects, bands or size are not what the survey has, or the folder cannot be written.
     """
     objects = located(of, survey.tables(catalog), catalog)
-    bands = bands or list(survey.instruments["roman"].bands)
+    bands = bands or list(survey.instruments[survey.sharpest].bands)
     layers = ("image", "background", "weight", "dq", "psf")
     every = {band: survey.cutouts(objects, layers, (band,), size) for band in bands}
     prepare(folder)
-    names = survey.output("exposures/roman").names
-    exptimes = dict(zip(names, survey.pointings("roman")["exptime"], strict=True))
+    names = survey.output(f"exposures/{survey.sharpest}").names
+    exptimes = dict(zip(names, survey.pointings(survey.sharpest)["exptime"], strict=True))
     written = []
     for band, found in every.items():
         units, image = np.unique(found["unit"].to_numpy(), return_inverse=True)
         exptime = np.array([exptimes[name] for name in units])
-        zero = 2.5 * np.log10(survey.instruments["roman"].bandpass(band).ab_photons() * exptime)
+        zero = 2.5 * np.log10(survey.instruments[survey.sharpest].bandpass(band).ab_photons() * exptime)
         derivatives = found["jacobian"].to_numpy()
         columns = {name: found[name].to_numpy() for name in ("object", "column", "row")}
         columns |= {name: found[f"{name}_image"].to_numpy() for name in ("x", "y")}

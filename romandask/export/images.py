@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +14,12 @@ import pandas as pd
 from romandask.export import fits_images, obscore
 from romandask.export.catalogs import indices_of, prepare
 from romandask.export.fits_images import Plane
-from romandask.instruments.instrument import exposure_of
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.measurement.measurement_image import errors, rms_of
 from romandask.model.errors import UserError
 from romandask.products.images import ImageProduct
-from romandask.stages.coadds.tile_maker import source_of, tile_maker
-from romandask.stages.exposures import empty_variance
-from romandask.stages.pointings import corners_of
+from romandask.stages.coadds.tile_maker import Coadds
+from romandask.stages.exposures.exposures import Exposures, empty_variance
 from romandask.survey import Survey
 
 AREA_ORDER = 14
@@ -36,7 +36,7 @@ def export_fits(
 
     Parameters
     ----------
-    name : roman or rubin
+    name : of the survey
     exposures, tiles : names; of tiles `bands`, all where there are none
 
     Raises
@@ -44,18 +44,20 @@ def export_fits(
     UserError
         If the survey has no such image, or it is not stored.
     """
-    chosen = []
+    images = []
     if exposures:
-        product = survey.output(f"exposures/{name}")
-        chosen += [(product, index, f"exposure-{name}") for index in units_named(product, exposures, "exposure")]
+        seen = survey.output(f"exposures/{name}")
+        for index in units_named(seen.product, exposures, "exposure"):
+            images.append((f"exposure-{name}-{seen.names[index]}", partial(_exposure, seen, index)))
     if tiles:
-        product = survey.output(f"coadds/{name}")
-        chosen += [(product, index, f"coadd-{name}") for index in tile_units(survey, name, tiles, bands)]
+        coadds = survey.output(f"coadds/{name}")
+        for index in tile_units(survey, name, tiles, bands):
+            images.append((f"coadd-{name}-{coadds.names[index]}", partial(_tile, coadds, index)))
     prepare(folder)
     written = []
-    for product, index, kind in chosen:
-        path = folder / f"{kind}-{product.names[index]}.fits"
-        wcs, primary, planes = (_exposure if product.stage.startswith("exposures") else _tile)(product, index)
+    for file, image in images:
+        path = folder / f"{file}.fits"
+        wcs, primary, planes = image()
         fits_images.write(path, {"ORIGIN": "romandask", "SURVEY": survey.pipeline.name} | primary, wcs, planes)
         written.append(path)
     return written
@@ -68,7 +70,7 @@ def tile_units(survey: Survey, name: str, tiles: Sequence[str], bands: Sequence[
     if wrong:
         raise UserError(f"band {wrong[0]!r}: {name} has {', '.join(known)}")
     units = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-    return units_named(survey.output(f"coadds/{name}"), units, "tile")
+    return units_named(survey.product(f"coadds/{name}"), units, "tile")
 
 
 def units_named(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:
@@ -80,11 +82,9 @@ def units_named(product: ImageProduct, names: Sequence[str], kind: str) -> list[
     return indices
 
 
-def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
-    source = source_of(product)
-    instrument, exposure = source.instrument, exposure_of(source.table.iloc[index])
-    header = instrument.header(exposure)
-    arrays = product.load(index, ("image", "variance", "dq"))
+def _exposure(exposures: Exposures, index: int) -> tuple[dict, dict, list[Plane]]:
+    instrument, exposure, header = exposures.instrument, exposures.exposure(index), exposures.header(index)
+    arrays = exposures.load(index, ("image", "variance", "dq"))
     electrons = arrays["image"].astype(np.float32)
 
     def error() -> np.ndarray:
@@ -92,7 +92,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
 
     sky = instrument.background(exposure, header)
     primary = {
-        "TELESCOP": instrument.name.capitalize(),
+        "TELESCOP": instrument.title,
         "FILTER": (exposure.band, "band"),
         "VISIT": (exposure.visit, "visit"),
         "DETECTOR": (exposure.detector, "detector (Roman: SCA)"),
@@ -105,7 +105,7 @@ def _exposure(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane
     planes = [
         Plane("SCI", lambda: electrons, "electron"),
         Plane("ERR", error, "electron"),
-        Plane("DQ", lambda: arrays["dq"], cards=_cards(product)),
+        Plane("DQ", lambda: arrays["dq"], cards=_cards(exposures.product)),
     ]
     return header, primary, planes
 
@@ -119,16 +119,14 @@ def _zero_point(bandpass: Any, seconds: float) -> float:
     return float(2.5 * np.log10(bandpass.ab_photons() * seconds))
 
 
-def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
-    maker = tile_maker(product)
-    here, scale = maker.unit(index), maker.instrument.coadd_scale
-    tile = index // len(maker.instrument.bands)
+def _tile(coadds: Coadds, index: int) -> tuple[dict, dict, list[Plane]]:
+    here, scale, product = coadds.tile_band(index), coadds.instrument.coadd_scale, coadds.product
 
     def plane(name: str) -> np.ndarray:
         return product.load(index, (name,))[name]
 
     primary = {
-        "TELESCOP": maker.instrument.name.capitalize(),
+        "TELESCOP": coadds.instrument.title,
         "FILTER": (here.band, "band"),
         "TILE": (here.tile.name, "tile of the survey's grid"),
         "NEXP": (len(here.members), "exposures that touch the tile"),
@@ -144,7 +142,7 @@ def _tile(product: ImageProduct, index: int) -> tuple[dict, dict, list[Plane]]:
         Plane("NIMAGES", lambda: plane("nimages")),
         Plane("PSF", lambda: plane("psf"), on_sky=False, cards=(("PIXSCALE", scale),)),
     ]
-    return maker.header(tile), primary, planes
+    return coadds.header(index), primary, planes
 
 
 def tile_error(product: ImageProduct, index: int) -> np.ndarray:
@@ -174,7 +172,7 @@ def export_obscore(survey: Survey, path: Path) -> int:
         If the ending is none of .vot, .xml, .fits and .parquet, or nothing is stored.
     """
     obscore.check(path)
-    parts = [_rows(survey, name, product) for name in survey.instruments for product in _images(survey, name)]
+    parts = [_rows(survey, images) for name in survey.instruments for images in _images(survey, name)]
     rows = pd.concat([part for part in parts if len(part)] or [pd.DataFrame()], ignore_index=True)
     if not len(rows):
         raise UserError("no image is stored yet: run the survey first")
@@ -183,62 +181,89 @@ def export_obscore(survey: Survey, path: Path) -> int:
     return len(rows)
 
 
-def _images(survey: Survey, name: str) -> list[ImageProduct]:
-    """Return the image products of one survey that are stored."""
-    found = [survey.output(f"coadds/{name}")]
-    if survey.instruments[name].coadd != "draw":
-        found.insert(0, survey.output(f"exposures/{name}"))
+@dataclass(frozen=True)
+class _Seen:
+    """What an image is made of, and where it is."""
+
+    exposures: pd.DataFrame
+    """Rows of the pointings."""
+    band: str
+    corners: np.ndarray
+    """(4, 2), degrees."""
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The exposures or the coadds of one survey, as archives describe them."""
+
+    images: Exposures | Coadds
+    calib_level: int
+    unit: str
+    pixel_scale: float
+    seen: Callable[[int], _Seen]
+    fwhm: Callable[[int], float]
+    """Of the PSF of an image, arcsec; NaN where it is not known."""
+
+
+def _images(survey: Survey, name: str) -> list[_Images]:
+    """Return the images of one survey: coadds, and exposures where they are made."""
+    coadds = survey.output(f"coadds/{name}")
+    instrument, table = coadds.instrument, coadds.exposures.table
+
+    def of_tile(index: int) -> _Seen:
+        here = coadds.tile_band(index)
+        return _Seen(table.iloc[here.members], here.band, coadds.footprints[index])
+
+    def fwhm(index: int) -> float:
+        return _fwhm(coadds.load(index, ("psf",))["psf"]) * instrument.coadd_scale
+
+    found = [_Images(coadds, 3, "nJy", instrument.coadd_scale, of_tile, fwhm)]
+    if instrument.coadd != "draw":
+        exposures = survey.output(f"exposures/{name}")
+
+        def of_exposure(index: int) -> _Seen:
+            return _Seen(table.iloc[[index]], str(exposures.unit_bands[index]), exposures.footprints[index])
+
+        # the PSF of an exposure would have to be drawn
+        found.insert(0, _Images(exposures, 2, "electron", instrument.pixel_scale, of_exposure, lambda index: np.nan))
     return found
 
 
-def _rows(survey: Survey, name: str, product: ImageProduct) -> pd.DataFrame:
+def _rows(survey: Survey, described: _Images) -> pd.DataFrame:
     """Return what ObsCore needs of every stored unit of an image product."""
-    instrument = survey.instruments[name]
-    stored = [index for index in range(len(product.names)) if product.has(index)]
-    table = survey.pointings(name)
-    of_tiles = product.stage.startswith("coadds")
-    side, scale = product.variables[0].shape, instrument.coadd_scale if of_tiles else instrument.pixel_scale
+    images, instrument = described.images, described.images.instrument
+    product = images.product
+    side, scale = images.image_shape, described.pixel_scale
     rows = []
-    for index in stored:
-        seen, band, corners = _seen(product, table, index)
-        seconds = float(seen["exptime"].sum())
-        wave = instrument.bandpass(band).wave
-        ends = seen["mjd"] + seen["exptime"] / 86400
+    for index in (index for index in range(len(images.names)) if images.has(index)):
+        seen = described.seen(index)
+        exposures = seen.exposures
+        wave = instrument.bandpass(seen.band).wave
+        ends = exposures["mjd"] + exposures["exptime"] / 86400
         rows.append(
             {
                 "obs_id": product.names[index],
                 "stage": product.stage,
-                "calib_level": 3 if of_tiles else 2,
-                "corners": corners,
+                "calib_level": described.calib_level,
+                "corners": seen.corners,
                 "fov": float(np.hypot(side[0], side[1]) * scale / 3600),
                 "pixels": side,
                 "pixel_scale": scale,
-                # an exposure's PSF would have to be drawn
-                "fwhm": _fwhm(product.load(index, ("psf",))["psf"]) * scale if of_tiles else np.nan,
-                "t_min": float(seen["mjd"].min()) if len(seen) else np.nan,
-                "t_max": float(ends.max()) if len(seen) else np.nan,
-                "t_exptime": seconds,
+                "fwhm": described.fwhm(index),
+                "t_min": float(exposures["mjd"].min()) if len(exposures) else np.nan,
+                "t_max": float(ends.max()) if len(exposures) else np.nan,
+                "t_exptime": float(exposures["exptime"].sum()),
                 "em": (float(wave[0]), float(wave[-1])),
-                "unit": "nJy" if of_tiles else "electron",
+                "unit": described.unit,
                 "bytes": sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in product.variables),
                 "survey": survey.pipeline.name,
-                "instrument": name,
-                "band": band,
+                "facility": instrument.facility,
+                "band": seen.band,
                 "place": str(survey.store.images(product.stage)) if survey.store else "",
                 "index": index,
             }
         )
     return pd.DataFrame(rows)
-
-
-def _seen(product: ImageProduct, table: pd.DataFrame, index: int) -> tuple[pd.DataFrame, str, np.ndarray]:
-    """Return the exposures (rows of the pointings) of which an image is made, its band, its corners (4, 2; degrees)."""
-    if product.stage.startswith("coadds"):
-        maker = tile_maker(product)
-        here = maker.unit(index)
-        return table.iloc[here.members], here.band, here.tile.corners(maker.settings.grid().side)
-    seen = table.iloc[[index]]
-    return seen, str(seen["band"].iloc[0]), corners_of(seen)[0]
 
 
 def _fwhm(psf: np.ndarray) -> float:
@@ -256,13 +281,13 @@ def export_moc(survey: Survey, folder: Path) -> list[Path]:
     """
     written = []
     for name in survey.instruments:
-        table = survey.pointings(name)
-        for product in _images(survey, name):
+        for described in _images(survey, name):
+            product = described.images.product
             polygons: dict[str, list[np.ndarray]] = {}
             for index in range(len(product.names)):
                 if product.has(index):
-                    _, band, corners = _seen(product, table, index)
-                    polygons.setdefault(band, []).append(corners)
+                    seen = described.seen(index)
+                    polygons.setdefault(seen.band, []).append(seen.corners)
             prepare(folder)
             for band, found in sorted(polygons.items()):
                 path = folder / f"{product.stage.replace('/', '-')}-{band}.moc.fits"

@@ -49,7 +49,6 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "em_band": ("", "instr.bandpass"),
 }
 """The mandatory columns of table 1 of ObsCore 1.1, with units and UCDs, then two that are optional."""
-FACILITIES = {"roman": ("Roman Space Telescope", "WFI"), "rubin": ("Rubin Observatory", "LSSTCam")}
 
 
 def check(path: Path) -> None:
@@ -64,13 +63,14 @@ def table_of(rows: pd.DataFrame) -> Table:
     Parameters
     ----------
     rows : obs_id, stage, index, place, calib_level, corners (4, 2; degrees), fov, pixels, pixel_scale, fwhm (arcsec;
-        NaN where it is not known), t_min, t_max, t_exptime, em (nm), unit, bytes, survey, instrument, band
+        NaN where it is not known), t_min, t_max, t_exptime, em (nm), unit, bytes, survey, facility (telescope,
+        camera), band
     """
     corners = np.stack(list(rows["corners"]))
     middle = _middle(corners)
     low, high = np.array(list(rows["em"])).T * 1e-9
     pixels = np.array(list(rows["pixels"]))
-    names = [FACILITIES.get(name, (name, name)) for name in rows["instrument"]]
+    names = list(rows["facility"])
     count = len(rows)
     columns = {
         "dataproduct_type": ["image"] * count,

@@ -17,8 +17,6 @@ from astropy.time import Time
 
 from romandask.model.errors import UserError
 
-ELEMENTS = {"Y106": "F106", "J129": "F129", "H158": "F158", "F184": "F184"}
-"""By band the name of the optical element."""
 WORDS = {
     "saturated": "SATURATED",
     "no_data": "DO_NOT_USE",
@@ -55,7 +53,7 @@ def write(
     planes : data (electron/s), err and var_poisson (its square), dq (our flags)
     flags : our bits, by name
     header : WCS (TAN-SIP), FITS cards
-    exposure : visit, detector, band, mjd, exptime, ra, dec, pa
+    exposure : visit, detector, band, mjd, exptime, ra, dec, pa, optical_element
     photometry : MJy/sr of one electron/s, and the mean area of a pixel, sr
 
     Raises
@@ -79,7 +77,7 @@ def write(
     end = Time(exposure["mjd"] + exposure["exptime"] / 86400, format="mjd", scale="utc").isot
     meta, detector = model.meta, f"WFI{int(exposure['detector']):02d}"
     meta.filename, meta.product_type, meta.calibration_software_name = path.name, "l2", "romandask"
-    meta.instrument.detector, meta.instrument.optical_element = detector, ELEMENTS[exposure["band"]]
+    meta.instrument.detector, meta.instrument.optical_element = detector, exposure["optical_element"]
     meta.exposure.start_time, meta.exposure.end_time = Time(start), Time(end)
     meta.exposure.exposure_time = meta.exposure.effective_exposure_time = float(exposure["exptime"])
     meta.observation.visit, meta.observation.observation_id = int(exposure["visit"]), str(exposure["visit"])
@@ -101,7 +99,7 @@ class Mosaic:
     version: str
     """Of what made it."""
     tile: str
-    band: str
+    optical_element: str
     scale: float
     """Arcsec a pixel."""
     native_scale: float
@@ -138,7 +136,7 @@ def write_mosaic(path: Path, planes: dict[str, np.ndarray], header: dict[str, An
     meta, shape = model.meta, planes["data"].shape
     meta.filename, meta.product_type = path.name, "l3"
     meta.calibration_software_name, meta.calibration_software_version = "romandask", about.version
-    meta.instrument.optical_element = ELEMENTS[about.band]
+    meta.instrument.optical_element = about.optical_element
     times = {"first": about.begin, "last": about.end, "mean": (about.begin + about.end) / 2}
     for name, mjd in times.items():
         meta.coadd_info[f"time_{name}"] = Time(mjd, format="mjd", scale="utc")

@@ -11,10 +11,10 @@ import numpy as np
 from romandask.export import roman_asdf
 from romandask.export.catalogs import prepare
 from romandask.export.images import counted, flags_of, tile_error, tile_units, units_named
-from romandask.instruments.instrument import exposure_of, pixel_areas
+from romandask.instruments.exposure import pixel_areas
+from romandask.model.errors import UserError
 from romandask.model.sky import ARCSEC
-from romandask.products.images import ImageProduct
-from romandask.stages.coadds.tile_maker import source_of, tile_maker
+from romandask.stages.coadds.tile_maker import Coadds
 from romandask.survey import Survey
 
 
@@ -27,15 +27,16 @@ def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[
         If the survey has no such exposure, it is not stored, or the package roman_datamodels is not there.
     """
     roman_asdf.available()
-    product = survey.output("exposures/roman")
+    name = _survey_of(survey)
+    images = survey.output(f"exposures/{name}")
+    instrument, product = images.instrument, images.product
     chosen = units_named(product, exposures, "exposure")
     flags = flags_of(product)
     prepare(folder)
     written = []
     for index in chosen:
-        source = source_of(product)
-        exposure, instrument = exposure_of(source.table.iloc[index]), source.instrument
-        header, arrays = instrument.header(exposure), product.load(index, ("image", "variance", "dq"))
+        exposure, header = images.exposure(index), images.header(index)
+        arrays = product.load(index, ("image", "variance", "dq"))
         rate = np.float32(1 / exposure.exptime)
         variance = arrays["variance"] if "variance" in arrays else counted(arrays["image"], instrument.detector)
         light = np.maximum(arrays["image"], 0).astype(np.float32)
@@ -48,8 +49,9 @@ def export_asdf(survey: Survey, folder: Path, exposures: Sequence[str]) -> list[
         area = float(np.mean(pixel_areas(header, instrument.shape))) * ARCSEC**2
         # AB: 3631 Jy give ab_photons electrons a second
         photometry = 3631e-6 / instrument.bandpass(exposure.band).ab_photons() / area, area
-        path = folder / f"exposure-roman-{product.names[index]}.asdf"
-        roman_asdf.write(path, planes, flags, header, vars(exposure), photometry)
+        element = instrument.data_model_elements[exposure.band]
+        path = folder / f"exposure-{name}-{product.names[index]}.asdf"
+        roman_asdf.write(path, planes, flags, header, vars(exposure) | {"optical_element": element}, photometry)
         written.append(path)
     return written
 
@@ -66,26 +68,34 @@ def export_mosaics(survey: Survey, folder: Path, tiles: Sequence[str], bands: Se
         If the survey has no such tile or band, it is not stored, or the package roman_datamodels is not there.
     """
     roman_asdf.available()
-    product = survey.output("coadds/roman")
-    chosen = tile_units(survey, "roman", tiles, bands)
+    name = _survey_of(survey)
+    coadds = survey.output(f"coadds/{name}")
+    chosen = tile_units(survey, name, tiles, bands)
     prepare(folder)
     written = []
     for index in chosen:
-        path = folder / f"coadd-roman-{product.names[index]}.asdf"
-        roman_asdf.write_mosaic(path, *_mosaic(survey, product, index))
+        path = folder / f"coadd-{name}-{coadds.names[index]}.asdf"
+        roman_asdf.write_mosaic(path, *_mosaic(survey, coadds, index))
         written.append(path)
     return written
 
 
-def _mosaic(survey: Survey, product: ImageProduct, index: int) -> tuple[dict, dict, roman_asdf.Mosaic]:
-    maker = tile_maker(product)
-    here, instrument = maker.unit(index), maker.instrument
-    found = product.load(index, ("image", "weight", "set", "sets"))
-    sets, rows = found["sets"], maker.source.table.iloc[here.members]
+def _survey_of(survey: Survey) -> str:
+    """Return the survey whose telescope has data models of its own."""
+    for name, instrument in survey.instruments.items():
+        if instrument.data_model_elements:
+            return name
+    raise UserError("export asdf is for the images of Roman, and this survey has none")
+
+
+def _mosaic(survey: Survey, coadds: Coadds, index: int) -> tuple[dict, dict, roman_asdf.Mosaic]:
+    here, instrument = coadds.tile_band(index), coadds.instrument
+    found = coadds.load(index, ("image", "weight", "set", "sets"))
+    sets, rows = found["sets"], coadds.exposures.table.iloc[here.members]
     # nJy a pixel to MJy/sr
     surface = np.float32(1e-15 / (instrument.coadd_scale**2 * ARCSEC**2))
     weight = found["weight"]
-    error = tile_error(product, index) * surface
+    error = tile_error(coadds.product, index) * surface
     electrons = instrument.bandpass(here.band).ab_photons() / 3631e9
     names = tuple(sets.drop_duplicates("input").sort_values("input")["exposure"])
     bit = {name: k for k, name in enumerate(names)}
@@ -108,13 +118,13 @@ def _mosaic(survey: Survey, product: ImageProduct, index: int) -> tuple[dict, di
         survey.pipeline.name,
         version("romandask"),
         here.tile.name,
-        here.band,
+        instrument.data_model_elements[here.band],
         instrument.coadd_scale,
         instrument.pixel_scale,
-        maker.settings.pixfrac,
+        coadds.settings.pixfrac,
         names,
         float(rows["mjd"].min()),
         float((rows["mjd"] + rows["exptime"] / 86400).max()),
         float(exposed[exposed > 0].mean()) if exposed.any() else 0.0,
     )
-    return planes, maker.header(index // len(instrument.bands)), about
+    return planes, coadds.header(index), about

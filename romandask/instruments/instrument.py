@@ -1,72 +1,153 @@
-"""What an exposure is, and the interface that every telescope offers to the stages."""
+"""What every telescope offers to the stages: the protocols of an instrument, of its readout and of its settings.
+
+A telescope is a folder beside this module and one line in `romandask.pipeline`. No other room knows its name: what
+differs between telescopes is asked of `Instrument`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Literal, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Protocol
 
 import galsim
 import numpy as np
 import pandas as pd
-from astropy.wcs import WCS
-from numpy.polynomial.chebyshev import chebvander
+import pyarrow as pa
 
+from romandask.instruments.exposure import Exposure
 from romandask.kernels.detectors.simple_detector import Detector
+from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
+from romandask.model.settings import Section
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
+from romandask.storage.arrays import Variable
+from romandask.storage.paths import AnyPath
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """One detector of one visit."""
+@dataclass(frozen=True, kw_only=True)
+class InstrumentContext:
+    """What an instrument takes from the other sections of a pipeline."""
 
-    visit: int
-    detector: int
-    band: str
-    mjd: float
-    """Start, days."""
-    exptime: float
-    """Seconds."""
-    ra: float
-    """Boresight (Roman: centre of the focal plane), degrees."""
-    dec: float
-    """Degrees."""
-    pa: float
-    """Position angle of the focal plane's +y axis, degrees east of north."""
-    seeing: float = np.nan
-    """Atmospheric FWHM at 500 nm and zenith, arcsec; NaN in space."""
-    airmass: float = np.nan
-    sky_brightness: float = np.nan
-    """AB mag / arcsec2; NaN in space."""
+    n_waves: int
+    """Wavelengths across a band at which PSFs are computed."""
+    seed: int
+    """Of the survey."""
+    data: AnyPath
+    """Folder that the paths of source files are relative to."""
+
+
+class InstrumentSettings(Section, ABC):
+    """The block of an instrument in a pipeline."""
+
+    every_band: ClassVar[tuple[str, ...]]
+    """Bands that the instrument has."""
+    usual_reference_band: ClassVar[str]
+    """Its reference band, where a pipeline has it."""
+    bands: Any
+    pointings: Any
+    """Its section `pointings`, with `source` and `path`."""
+
+    @abstractmethod
+    def instrument(self, context: InstrumentContext) -> Instrument:
+        """Return the instrument with these settings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Publication:
+    """Published figures of a survey, beside which the report puts its own."""
+
+    source: str
+    depths: Mapping[str, float] = field(default_factory=dict)
+    """5-sigma depth of point sources by band, AB mag."""
+    galaxies: float | None = None
+    """Detected galaxies a square degree."""
+    stars: float | None = None
+    """Detected stars a square degree."""
+
+
+class Light(Protocol):
+    """The light on one exposure, before the detector: what a readout turns into data."""
+
+    exposure: Exposure
+    background: np.ndarray
+    """(ny, nx) expected electrons that do not come from objects."""
 
     @property
-    def name(self) -> str:
-        """Unit name: band, visit and detector."""
-        return f"{self.band}-{self.visit}-{self.detector}"
+    def scene(self) -> Scene:
+        """The objects, in pixels and electrons."""
+
+    @property
+    def stamp_sizes(self) -> np.ndarray:
+        """(n,) pixels along a side of the stamp of each object; 0 for one that is not drawn."""
+
+    def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
+        """Return the noiseless image (ny, nx), electrons, of the objects, or of those where `chosen` (n,) is true."""
+
+    def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
+        """Return the cell of a position and GalSim's PSFs there, one a node."""
 
 
-EXPOSURE_COLUMNS = tuple(field.name for field in fields(Exposure))
+class Readout(Protocol):
+    """A detector: turns light into what an exposure stores."""
 
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """The arrays of an exposure beside the noiseless image, `image` first."""
 
-def exposure_of(row: pd.Series) -> Exposure:
-    """Return the exposure of a row of a pointings table."""
-    kinds = {"visit": int, "detector": int, "band": str}
-    return Exposure(**{name: kinds.get(name, float)(row[name]) for name in EXPOSURE_COLUMNS})
+    @property
+    def tables(self) -> dict[str, pa.Schema]:
+        """Tables that are stored with an exposure: what it leaves to later ones."""
 
+    @property
+    def seconds_per_pixel(self) -> float:
+        """Time of a core that sky, noise, detector and storage take, as measured on a laptop."""
 
-def exposures_of(table: pd.DataFrame) -> list[Exposure]:
-    """Return the exposures of all rows of a pointings table."""
-    columns = [table[name].tolist() for name in EXPOSURE_COLUMNS]
-    return [Exposure(*values) for values in zip(*columns, strict=True)]
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the arrays depend on, beside the settings that all instruments share."""
+
+    def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
+        """Return the rows of a pointings table whose exposures leave charge in that of a row, in order of time."""
+
+    def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
+        """Return the (stage, unit) that an exposure reads, beside the truth."""
+
+    def leave(self, light: Light) -> pd.DataFrame:
+        """Return the table that an exposure leaves to later ones."""
+
+    def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
+        """Return the arrays of an exposure by name, the noiseless `truth` among them, and its tables.
+
+        Parameters
+        ----------
+        light : Light
+        left : sequence of (Exposure, DataFrame)
+            Earlier exposures and what they left.
+        """
 
 
 class Instrument(Protocol):
-    """A telescope and its camera, as the stages see it; one file a telescope."""
+    """A telescope and its camera, as the stages see it."""
 
     name: str
+    """Of its block in a pipeline, and of its products."""
+    title: str
+    """For people: `Roman`."""
+    facility: tuple[str, str]
+    """Names of the telescope and of the camera, as archives write them."""
+    code: int
+    """Unique number among all instruments, 0 to 7: part of the keys of friends of friends."""
+    blend_role: Literal["sharp", "blended"] | None
+    """Part in the count of unrecognised blends: objects of the blended survey that are several of the sharp one."""
+    data_model_elements: Mapping[str, str]
+    """By band, the name of the optical element in the mission's own data models (roman_datamodels); empty where there
+    are none for this telescope."""
+    publication: Publication | None
+    """Published figures, for the report."""
     coadd_scale: float
     """Pixel scale of its coadds, arcsec."""
     pixel_scale: float
@@ -85,9 +166,24 @@ class Instrument(Protocol):
     detection_bands: tuple[str, ...] | None
     """Bands that enter it; None for all."""
 
+    visit_seconds: float
+    """Exposure time of one visit where the weight of a coadd is not its exposure time."""
+
     @property
     def bands(self) -> tuple[str, ...]:
         """Bands of this pipeline."""
+
+    @property
+    def reference_band(self) -> str:
+        """Band in which objects are counted and compared with the truth."""
+
+    @property
+    def colour_band(self) -> str:
+        """Band of the colour between two surveys' counterparts of an object."""
+
+    @property
+    def picture_bands(self) -> tuple[str, ...]:
+        """Bands of this pipeline from red to blue, for colour pictures."""
 
     @property
     def psf_settings(self) -> dict[str, object]:
@@ -103,6 +199,29 @@ class Instrument(Protocol):
 
     def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
         """Return the lazy calibrations of some detectors; None where the instrument has none."""
+
+    def readout(self, seed: int, calibration: ImageProduct | None) -> Readout:
+        """Return the detector.
+
+        Parameters
+        ----------
+        seed : int
+            Of the survey.
+        calibration : ImageProduct or None
+            What `calibrations` returned, stored or not; None where the instrument is not calibrated.
+        """
+
+    def effects(
+        self,
+        readout: Readout,
+        light: Light,
+        expected: np.ndarray,
+        left: Sequence[tuple[Exposure, pd.DataFrame]],
+    ) -> dict[str, np.ndarray]:
+        """Return what each effect of the detector does around the brightest object: images (n, n), electrons.
+
+        Empty where the detector has no effects that can be taken apart.
+        """
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass, with the wavelengths at which the PSF is known."""
@@ -147,41 +266,8 @@ class Instrument(Protocol):
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
         """Return the noise of an empty pixel, electrons rms."""
 
+    def pixel_noise(self, exposure: Exposure) -> float:
+        """Return the noise of an empty pixel, electrons rms, without making the image of the background."""
 
-def footprint(header: dict, shape: tuple[int, int]) -> np.ndarray:
-    """Return the corners (4, 2) of an image on the sky, degrees, in order."""
-    ny, nx = shape
-    x = np.array([-0.5, nx - 0.5, nx - 0.5, -0.5])
-    y = np.array([-0.5, -0.5, ny - 0.5, ny - 0.5])
-    return np.stack(WCS(header).all_pix2world(x, y, 0), axis=1)
-
-
-WHOLE = slice(None)
-
-
-def pixel_areas(
-    header: dict, shape: tuple[int, int], rows: slice = WHOLE, columns: slice = WHOLE, knots: int = 17
-) -> np.ndarray:
-    """Return the area, arcsec2, of the pixels of some rows and columns of an image, (ny, nx) float32.
-
-    The area varies smoothly (SIP of fourth order): it is computed exactly on a coarse grid and interpolated by
-    Chebyshev polynomials of eighth order, to better than 1e-6.
-    """
-    wcs = WCS(header)
-    ys, xs = (np.linspace(0, n - 1, knots) for n in shape)
-    x, y = np.meshgrid(xs, ys)
-    sides = {}
-    for name, dx, dy in (("e", 0.5, 0), ("w", -0.5, 0), ("n", 0, 0.5), ("s", 0, -0.5)):
-        sides[name] = np.stack(wcs.all_pix2world(x + dx, y + dy, 0))
-    middle = np.radians((sides["e"][1] + sides["w"][1]) / 2)
-
-    def step_of(a: str, b: str) -> tuple[np.ndarray, np.ndarray]:
-        east = ((sides[a][0] - sides[b][0] + 180) % 360 - 180) * np.cos(middle)
-        return east * 3600, (sides[a][1] - sides[b][1]) * 3600
-
-    (xe, xn), (ye, yn) = step_of("e", "w"), step_of("n", "s")
-    area = np.abs(xe * yn - xn * ye)
-    left, right = (chebvander(2 * axis / axis[-1] - 1, 8) for axis in (ys, xs))
-    coefficients = np.linalg.pinv(left) @ area @ np.linalg.pinv(right).T
-    at = [np.arange(n)[part] * 2 / (n - 1) - 1 for n, part in zip(shape, (rows, columns), strict=True)]
-    return (chebvander(at[0], 8) @ coefficients).astype(np.float32) @ chebvander(at[1], 8).T.astype(np.float32)
+    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray) -> PsfModel:
+        """Return the weighted mean PSF of some exposures of one band, for tiles that are drawn from the cadence."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import types
 import typing
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,19 @@ def distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
     if again:
         raise ValueError(f"{again[0]} is there twice")
     return values
+
+
+def one_of(names: Iterable[str]) -> Callable[[str], str]:
+    """Return a validator that takes one of some names."""
+    known = tuple(names)
+
+    def validator(value: str) -> str:
+        if value not in known:
+            *others, last = (repr(name) for name in known)
+            raise ValueError(f"Input should be {', '.join(others)} or {last} (found {value!r})")
+        return value
+
+    return validator
 
 
 class RegionSettings(Section):
@@ -148,8 +162,11 @@ class DetectionSettings(Section):
 
 
 class MatchSettings(Section):
-    """Friends of friends over the samples of all surveys."""
+    """Friends of friends over the samples of two surveys."""
 
+    surveys: tuple[str, str] | None = Field(
+        None, description="the sharp survey and the blended one; those that declare these parts if not given"
+    )
     linking_lengths: Annotated[tuple[Annotated[float, Field(gt=0)], ...], AfterValidator(distinct)] = Field(
         (1.0, 0.5), min_length=1, description="arcsec"
     )
@@ -165,8 +182,8 @@ class MatchSettings(Section):
 class DifferenceSettings(Section):
     """Difference images: Rubin's tiles less Roman's, where the survey has both bands."""
 
-    template: Literal["Y106", "J129", "H158", "F184"] = Field("Y106", description="Roman's band")
-    science: Literal["u", "g", "r", "i", "z", "y"] = Field("y", description="Rubin's band, from which it is taken away")
+    template: str = Field("Y106", description="band of the sharper survey")
+    science: str = Field("y", description="band of the other survey, from which it is taken away")
     min_snr: float = Field(20.0, gt=0, description="of objects by which both are matched, and whose residuals are told")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -14,34 +15,44 @@ from matplotlib.figure import Figure
 from romandask.model.sky import Region, covering_sums
 from romandask.model.spectra import ab_magnitude
 
-ROMAN_RGB = ("F184", "H158", "J129", "Y106")
-RUBIN_RGB = ("z", "i", "r", "g")
-RGB = (*ROMAN_RGB, *RUBIN_RGB)
-"""Bands from red to blue, of both telescopes."""
 LARGEST_PICTURE_PIXELS = 1600
 """Pixels a side of a picture of a tile; larger tiles are shown by their middle."""
 
 
-def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: dict[str, pd.DataFrame]) -> bytes:
+@dataclass(frozen=True)
+class TileImages:
+    """The images of one tile as a survey sees it."""
+
+    bands: dict[str, np.ndarray]
+    """By band, (ny, nx)."""
+    red_to_blue: tuple[str, ...]
+    """Bands for colours."""
+    scale: float
+    """arcsec a pixel"""
+
+
+def colour_pair(tiles: dict[str, TileImages], objects: dict[str, pd.DataFrame]) -> bytes:
     """Return the same sky in colour as each survey sees it, side by side.
 
     Parameters
     ----------
-    tiles : by survey, the images by band and the pixel scale (arcsec)
-    objects : by survey, the detected objects of the tile, circled
+    tiles : dict of str to TileImages
+        By survey.
+    objects : dict of str to DataFrame
+        By survey, the detected objects of the tile, circled.
     """
     figure = figure_of(7.2 * len(tiles), 7.4)
-    extent = min(min(next(iter(bands.values())).shape) * scale for bands, scale in tiles.values())
+    extent = min(min(next(iter(tile.bands.values())).shape) * tile.scale for tile in tiles.values())
     # very large tiles are shown by their middle, the same sky for every survey
-    extent = min(extent, LARGEST_PICTURE_PIXELS * min(scale for _, scale in tiles.values()))
-    for position, (survey, (bands, scale)) in enumerate(tiles.items()):
+    extent = min(extent, LARGEST_PICTURE_PIXELS * min(tile.scale for tile in tiles.values()))
+    for position, (survey, tile) in enumerate(tiles.items()):
         axes = figure.add_subplot(1, len(tiles), position + 1)
-        chosen = colours_of_bands(tuple(bands))
-        side = next(iter(bands.values())).shape[0]
+        chosen, scale = three_of(tile.red_to_blue), tile.scale
+        side = next(iter(tile.bands.values())).shape[0]
         count = int(extent / scale)
         first = (side - count) // 2
         cut = slice(first, first + count)
-        planes = [in_sigma(bands[name][cut, cut]) for name in chosen]
+        planes = [in_sigma(tile.bands[name][cut, cut]) for name in chosen]
         picture = coloured(planes)
         half = count * scale / 2
         axes.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
@@ -56,10 +67,9 @@ def colour_pair(tiles: dict[str, tuple[dict[str, np.ndarray], float]], objects: 
     return png(figure)
 
 
-def colours_of_bands(bands: tuple[str, ...]) -> tuple[str, str, str]:
-    """Return which of some bands are red, green and blue; where there are few, one is more than one of them."""
-    names = [name for name in RGB if name in bands] or list(bands)
-    return names[0], names[len(names) // 2], names[-1]
+def three_of(red_to_blue: tuple[str, ...]) -> tuple[str, str, str]:
+    """Return which bands are red, green and blue; where there are fewer than three, one has several of these parts."""
+    return red_to_blue[0], red_to_blue[len(red_to_blue) // 2], red_to_blue[-1]
 
 
 def coloured(planes: Sequence[np.ndarray]) -> np.ndarray:

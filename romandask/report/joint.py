@@ -9,8 +9,7 @@ import pandas as pd
 
 from romandask.report import figures, joint_figures
 from romandask.report.html import image_of, table_of
-from romandask.stages.analysis.friends_of_friends import length_name
-from romandask.stages.coadds.tile_maker import tile_maker, unit_of
+from romandask.stages.analysis.friends_of_friends import blend_pair, joint, length_name
 from romandask.survey import Survey
 
 FIELD = 12.0
@@ -24,21 +23,24 @@ def blends(survey: Survey) -> str:
     if not _joint(survey):
         return ""
     lengths, statistics = survey.pipeline.matches.linking_lengths, survey.statistics
-    rows = {name: len(survey.output(f"samples/{name}").column("objectId")) for name in survey.instruments}
-    limits = [survey.output(f"limits/{name}").load(0).iloc[0] for name in survey.instruments]
+    pair = survey.once(joint)
+    names = pair.sharp, pair.blended
+    sharp, blended = (survey.instruments[name].title for name in names)
+    rows = [len(survey.output(f"samples/{name}").column("objectId")) for name in names]
+    limits = [survey.output(f"limits/{name}").load(0).iloc[0] for name in names]
     cuts = ", ".join(f"{row['band']} < {row['limit']:.2f}" for row in limits if np.isfinite(row["limit"]))
     kind = "unflagged, with a true counterpart" if survey.pipeline.matches.sample == "clean" else "all objects"
     text = (
-        f"<h2>Blends</h2><p>Friends of friends over {rows['roman']} objects of Roman and {rows['rubin']} of Rubin: "
-        f"{kind}{', ' + html.escape(cuts) if cuts else ''}. An unrecognised blend is alone of Rubin in a group with "
-        "two or more objects of Roman.</p>"
+        f"<h2>Blends</h2><p>Friends of friends over {rows[0]} objects of {sharp} and {rows[1]} of {blended}: "
+        f"{kind}{', ' + html.escape(cuts) if cuts else ''}. An unrecognised blend is alone of {blended} in a group "
+        f"with two or more objects of {sharp}.</p>"
     )
     for length in lengths:
         counts = statistics.blends(length)
         if counts.size:
             text += image_of(
                 figures.blend_matrix(counts, length),
-                f"Numbers of groups at a linking length of {length:g} arcsec. Rows: Roman, columns: Rubin.",
+                f"Numbers of groups at a linking length of {length:g} arcsec. Rows: {sharp}, columns: {blended}.",
             )
     tables = {length: statistics.unrecognised(length) for length in lengths}
     chance = {length: statistics.chance(length) for length in lengths}
@@ -68,7 +70,7 @@ def _blend_row(survey: Survey, length: float, table: pd.DataFrame, chance: pd.Da
     objects, blends = int(total["rubin_objects"]), int(total["blends"])
     counts = survey.statistics.blends(length)
     alone = int(counts.loc[0].drop(0, errors="ignore").sum()) if 0 in counts.index else 0
-    faintest = float(survey.output("limits/rubin").load(0)["limit"].iloc[0])
+    faintest = float(survey.output(f"limits/{survey.once(joint).blended}").load(0)["limit"].iloc[0])
     near = table.loc[table["i_mag_high"] > faintest - 1, "alone"].sum()
 
     def share(part: float, whole: float) -> str:
@@ -95,51 +97,52 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     here = groups[[row.objectId in ids[row.survey] for row in groups.itertuples()]]
     if not len(here):
         return ""
+    pair = survey.once(joint)
     tiles = {key: survey.output(f"coadds/{key}") for key in survey.instruments}
-    makers = {key: tile_maker(product) for key, product in tiles.items()}
-    frames, images = {key: maker.wcs(tile) for key, maker in makers.items()}, {}
-    x, y = frames["rubin"].all_world2pix(here["coord_ra"], here["coord_dec"], 0)
-    scale = survey.instruments["rubin"].coadd_scale
+    frames, images = {key: coadds.wcs(tile) for key, coadds in tiles.items()}, {}
+    wide = frames[pair.blended]
+    x, y = wide.all_world2pix(here["coord_ra"], here["coord_dec"], 0)
+    scale = survey.instruments[pair.blended].coadd_scale
     middle = _crowded(np.stack([x, y], axis=1) * scale, here["blend"].to_numpy(), FIELD)
     # the field lies within the tile
-    extent = scale * makers["rubin"].pixels
+    extent = scale * tiles[pair.blended].pixels
     middle = np.clip(middle, min(FIELD + 1, extent / 2), max(extent - FIELD - 1, extent / 2))
-    at = frames["rubin"].all_pix2world(*(middle[:, None] / scale), 0)
-    for key, product in tiles.items():
-        instrument = survey.instruments[key]
+    at = wide.all_pix2world(*(middle[:, None] / scale), 0)
+    for key, coadds in tiles.items():
+        instrument = coadds.instrument
         u, v = (int(round(float(value[0]))) for value in frames[key].all_world2pix(*at, 0))
         count = int(FIELD / instrument.coadd_scale)
-        side = makers[key].pixels
+        side = coadds.pixels
         window = tuple(slice(max(place - count, 0), min(place + count + 1, side)) for place in (v, u))
         images[key] = {
-            band: product.load(unit_of(tile, band, instrument.bands), ("image",), window)["image"]
-            for band in instrument.bands
+            band: coadds.load(coadds.index(tile, band), ("image",), window)["image"] for band in instrument.bands
         }
-    marks = {
-        key: here[here["survey"] == key].assign(
-            x=x[here["survey"] == key] * scale - middle[0], y=y[here["survey"] == key] * scale - middle[1]
-        )
-        for key in survey.instruments
-    }
+    marks = {}
+    for part, key in (("sharp", pair.sharp), ("blended", pair.blended)):
+        own = (here["survey"] == key).to_numpy()
+        marks[part] = here[own].assign(x=x[own] * scale - middle[0], y=y[own] * scale - middle[1])
+    red_to_blue = {key: instrument.picture_bands for key, instrument in survey.instruments.items()}
+    sharp, blended = (survey.instruments[key].title for key in (pair.sharp, pair.blended))
     return "<h2>One field in every band</h2>" + image_of(
-        joint_figures.field(images, FIELD, marks),
-        f"The {2 * FIELD:g} arcsec of tile {name} with the most unrecognised blends. Large circles: objects of Rubin, "
-        f"small ones: of Roman, both of the samples; red: one of Rubin that is two or more of Roman within "
-        f"{survey.pipeline.matches.linking_lengths[0]:g} arcsec.",
+        joint_figures.field(images, red_to_blue, FIELD, marks),
+        f"The {2 * FIELD:g} arcsec of tile {name} with the most unrecognised blends. Large circles: objects of "
+        f"{blended}, small ones: of {sharp}, both of the samples; red: one of {blended} that is two or more of {sharp} "
+        f"within {survey.pipeline.matches.linking_lengths[0]:g} arcsec.",
     )
 
 
 def _joint(survey: Survey) -> bool:
-    return {"roman", "rubin"} <= set(survey.instruments)
+    return survey.once(blend_pair) is not None
 
 
 def _with_blends(survey: Survey) -> pd.DataFrame:
     """Return the objects of all groups with `blend`: True in an unrecognised one, at the first linking length."""
     groups = survey.output("matches/groups").all_rows()
     number = groups[f"group_{length_name(survey.pipeline.matches.linking_lengths[0])}"]
-    rubin = (groups["survey"] == "rubin").groupby(number).transform("sum")
-    roman = (groups["survey"] == "roman").groupby(number).transform("sum")
-    return groups.assign(blend=(rubin == 1) & (roman >= 2))
+    pair = survey.once(joint)
+    blended = (groups["survey"] == pair.blended).groupby(number).transform("sum")
+    sharp = (groups["survey"] == pair.sharp).groupby(number).transform("sum")
+    return groups.assign(blend=(blended == 1) & (sharp >= 2))
 
 
 def _crowded(places: np.ndarray, blend: np.ndarray, half: float) -> np.ndarray:
@@ -150,33 +153,34 @@ def _crowded(places: np.ndarray, blend: np.ndarray, half: float) -> np.ndarray:
 
 
 def difference_images(survey: Survey) -> str:
-    """Return the differences of Rubin's tiles and Roman's: a picture of one, and what is left of all objects."""
+    """Return the difference images: a picture of one, and what is left of all objects."""
     if not survey.differs:
         return ""
-    product, settings = survey.output("differences/rubin"), survey.pipeline.differences
+    settings = survey.pipeline.differences
+    name = next(key for key, one in survey.instruments.items() if settings.science in one.bands)
+    instrument, product = survey.instruments[name], survey.output(f"differences/{name}")
     tables = [product.load(k, ("residuals",))["residuals"] for k in range(len(product.units))]
     table = pd.concat(tables)
     if not len(table):
         return ""
     tile = int(np.argmax([len(one) for one in tables]))
     arrays = product.load(tile)
-    science = survey.output("coadds/rubin").load(
-        tile * len(survey.bands("rubin")) + survey.bands("rubin").index(settings.science), ("image",)
-    )["image"]
-    count = int(SHOWN / survey.instruments["rubin"].coadd_scale)
+    coadds = survey.output(f"coadds/{name}")
+    science = coadds.load(coadds.index(tile, settings.science), ("image",))["image"]
+    count = int(SHOWN / instrument.coadd_scale)
     middle = science.shape[0] // 2
     part = (slice(max(middle - count, 0), middle + count),) * 2
     seen = arrays["rms"] > 0
     sigma = arrays["difference"][seen] / arrays["rms"][seen]
     images = {
-        f"Rubin {settings.science}": science[part],
-        f"Roman {settings.template}, matched": arrays["template"][part],
+        f"{instrument.title} {settings.science}": science[part],
+        f"{settings.template}, matched": arrays["template"][part],
         "difference": arrays["difference"][part],
     }
     offset = np.hypot(table["dx"], table["dy"])
     text = (
         f"<p>{len(table)} objects of S/N above {settings.min_snr:g}: median shifts {table['dx'].median():+.4f} and "
-        f"{table['dy'].median():+.4f} pixels of {survey.instruments['rubin'].coadd_scale:g} arcsec, half of all within "
+        f"{table['dy'].median():+.4f} pixels of {instrument.coadd_scale:g} arcsec, half of all within "
         f"{offset.median():.3f}; scatter of the light that is left {1.4826 * np.median(np.abs(table['share'])):.1%} of "
         f"theirs, for their colours; pixels over their rms: {1.4826 * np.median(np.abs(sigma)):.3f}.</p>"
     )
@@ -185,8 +189,7 @@ def difference_images(survey: Survey) -> str:
         + text
         + image_of(
             joint_figures.difference(images, sigma, table),
-            f"The middle of tile {survey.tiles[tile].name}: what Rubin sees in {settings.science}, Roman's "
-            f"{settings.template} with its PSF, and the difference; and by how much objects are off their places. The "
-            "circle is a tenth of a pixel.",
+            f"The middle of tile {survey.tiles[tile].name}: {settings.science}, {settings.template} with its PSF, "
+            "and the difference; and by how much objects are off their places. The circle is a tenth of a pixel.",
         )
     )

@@ -6,26 +6,33 @@ import numpy as np
 import pandas as pd
 from matplotlib.patches import Circle
 
-from romandask.report.figures import coloured, colours_of_bands, figure_of, in_sigma, png
+from romandask.report.figures import coloured, figure_of, in_sigma, png, three_of
 
-CIRCLES = {"roman": (26, 0.7), "rubin": (260, 1.0)}
-"""Area (points2) and width of the circles of a survey's objects."""
+CIRCLES = {"sharp": (26, 0.7), "blended": (260, 1.0)}
+"""Area (points2) and width of the circles of objects, by the part of their survey."""
 
 
-def field(images: dict[str, dict[str, np.ndarray]], half: float, marks: dict[str, pd.DataFrame]) -> bytes:
+def field(
+    images: dict[str, dict[str, np.ndarray]],
+    red_to_blue: dict[str, tuple[str, ...]],
+    half: float,
+    marks: dict[str, pd.DataFrame],
+) -> bytes:
     """Return one field in colour and in each band, a row a survey; circles in the first pictures, red in blends.
 
     Parameters
     ----------
     images : by survey and band, square and centred on one place
+    red_to_blue : by survey, the bands for colours
     half : half their side, arcsec
-    marks : by survey, objects: x, y (arcsec from the middle, along the images' axes) and blend (True in one)
+    marks : by `sharp` and `blended`, objects of these surveys: x, y (arcsec from the middle, along the images' axes)
+        and blend (True in one)
     """
     columns = max(len(bands) for bands in images.values()) + 1
     figure = figure_of(2.4 * columns, 2.6 * len(images))
     place = {"origin": "lower", "extent": (-half, half, -half, half), "interpolation": "nearest"}
     for row, (survey, bands) in enumerate(images.items()):
-        names = colours_of_bands(tuple(bands))
+        names = three_of(red_to_blue[survey])
         planes = [in_sigma(bands[name]) for name in names]
         axes = figure.add_subplot(len(images), columns, row * columns + 1)
         axes.imshow(coloured(planes), **place)

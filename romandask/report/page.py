@@ -8,35 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.roman.sca_effects import differences
-from romandask.instruments.roman.sca_readout import before
 from romandask.model.spectra import ab_magnitude
-from romandask.report import figures as pictures
+from romandask.report import figures
 from romandask.report.html import image_of, table_of
 from romandask.report.joint import blends, difference_images, field
 from romandask.run import run_figures, stored_versions
 from romandask.stages.analysis.shear import significance
 from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth
-from romandask.stages.coadds.tile_maker import unit_of
-from romandask.stages.detections.truth_match import reference_band
 from romandask.stages.pointings import corners_of
 from romandask.storage.paths import AnyPath, bytes_below, write_bytes
 from romandask.survey import Survey
-
-PAPER_DEPTHS = {"Y106": 26.9, "J129": 26.9, "H158": 26.9, "F184": 26.2}
-"""5-sigma depths of point sources, AB mag (Troxel et al. 2023)."""
-PAPER_AREA = 1039 * 0.125**2
-"""Square degrees of its tiles' unique areas."""
-PAPER_COUNTS = {
-    key: count / PAPER_AREA
-    for key, count in {
-        ("roman", "galaxies"): 12_432_713,
-        ("roman", "stars"): 215_613,
-        ("rubin", "galaxies"): 6_831_656,
-        ("rubin", "stars"): 159_575,
-    }.items()
-}
-"""Detected objects per square degree."""
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2em auto; padding: 0 1em; color: #1c2430; }
@@ -97,39 +78,42 @@ def _overview(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
 def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     pairs, layers = {}, {}
     for name, instrument in survey.instruments.items():
-        product = survey.output(f"coadds/{name}")
+        coadds = survey.output(f"coadds/{name}")
         bands = {}
         for position, band in enumerate(instrument.bands):
-            arrays = product.load(unit_of(tile, band, instrument.bands), ("image", "weight", "nimages"))
+            arrays = coadds.load(coadds.index(tile, band), ("image", "weight", "nimages"))
             bands[band] = arrays["image"]
             if position == len(instrument.bands) // 2:
                 layers[name] = (arrays["weight"], arrays["nimages"], band)
-        pairs[name] = (bands, instrument.coadd_scale)
+        pairs[name] = figures.TileImages(bands, instrument.picture_bands, instrument.coadd_scale)
     label = survey.tiles[tile].name
     circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
     return (
         "<h2>The same sky</h2>"
         + image_of(
-            pictures.colour_pair(pairs, circled),
+            figures.colour_pair(pairs, circled),
             f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
         )
-        + image_of(pictures.maps(layers), "Weight and number of exposures of the tile.")
+        + image_of(figures.maps(layers), "Weight and number of exposures of the tile.")
     )
 
 
 def _detector(survey: Survey) -> str:
     """Return what each effect of the detectors does, where they are modelled in full."""
-    if survey.pipeline.calibration() is None:
-        return ""
-    product, table = survey.output("exposures/roman"), survey.pointings("roman")
-    # one that has an afterglow, if there is one
-    index = next((row for row in range(len(table)) if len(before(table, row))), 0)
-    name = product.names[index]
-    return "<h2>The detectors</h2>" + image_of(
-        pictures.effects({found.effect: found.image for found in differences(product, index)}),
-        f"What each effect of the SCA does around the brightest star of exposure {name}: with it less without it, all "
-        "else and the random numbers the same, in electrons.",
-    )
+    text = ""
+    for name, instrument in survey.instruments.items():
+        if not instrument.calibrated:
+            continue
+        exposures = survey.output(f"exposures/{name}")
+        earlier, table = exposures.renderer.readout.earlier, exposures.table
+        # an exposure with an afterglow, if there is one
+        index = next((row for row in range(len(table)) if len(earlier(table, row))), 0)
+        text += "<h2>The detectors</h2>" + image_of(
+            figures.effects(exposures.effects(index)),
+            f"What each effect of the detector does around the brightest star of exposure {exposures.names[index]}: "
+            "with it less without it, all else and the random numbers the same, in electrons.",
+        )
+    return text
 
 
 def _inputs(survey: Survey) -> str:
@@ -137,16 +121,16 @@ def _inputs(survey: Survey) -> str:
     frames = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
     galaxies, stars = (frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in frames)
     bands = tuple(survey.bandpasses)
-    # blue and red of each survey
-    shown = tuple(dict.fromkeys(band for band in ("r", "i", "H158", bands[0], bands[-1]) if band in bands))[:4]
+    references = [instrument.reference_band for instrument in survey.instruments.values()]
+    shown = tuple(dict.fromkeys(band for band in (*references, bands[0], bands[-1])))[:4]
     text = "<h2>The true universe and where it is looked at</h2>" + image_of(
-        pictures.input_distributions(galaxies, stars, survey.region.area, shown),
+        figures.input_distributions(galaxies, stars, survey.region.area, shown),
         f"{len(galaxies)} galaxies and {len(stars)} stars of the region, by component.",
     )
     for name, instrument in survey.instruments.items():
         table = survey.pointings(name)
         footprints = {band: corners_of(table[table["band"] == band]) for band in instrument.bands}
-        text += image_of(pictures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
+        text += image_of(figures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
     return text
 
 
@@ -174,32 +158,32 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
         "<h2>Measurements</h2>"
         + _beside_the_paper(survey, objects, joined, depth)
         + image_of(
-            pictures.magnitude_histograms(true, measured, depth),
+            figures.magnitude_histograms(true, measured, depth),
             "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
             "5-sigma depths of point sources.",
         )
         + (
             image_of(
-                pictures.colour_histograms(colours),
+                figures.colour_histograms(colours),
                 "Colours of objects with a signal to noise above 10 in both bands: true (grey) and measured.",
             )
             if colours
             else ""
         )
         + image_of(
-            pictures.size_magnitude(objects, middle),
+            figures.size_magnitude(objects, middle),
             "Size and magnitude; point sources form the locus at the PSF's size.",
         )
         + image_of(
-            pictures.residuals(found),
+            figures.residuals(found),
             "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
             "their errors (pulls), median and scatter; and the share of objects that are flagged.",
         )
         + image_of(
-            pictures.completeness(
+            figures.completeness(
                 {name: survey.completeness(name) for name in survey.instruments},
                 matched,
-                {name: reference_band(instrument) for name, instrument in survey.instruments.items()},
+                {name: instrument.reference_band for name, instrument in survey.instruments.items()},
             ),
             "Objects against the truth: the share of true objects that was found, in true magnitudes, the share of "
             "objects that are real, in measured ones; Kron magnitudes less those of the counterparts, stars in red.",
@@ -214,15 +198,16 @@ def _beside_the_paper(
     degrees = survey.region.area / 3600
     rows = []
     for name, frame in objects.items():
+        published = survey.instruments[name].publication
         stars = joined[name]["star"].to_numpy(bool)
         for kind, count in (("galaxies", int((~stars).sum())), ("stars", int(stars.sum()))):
-            paper = PAPER_COUNTS.get((name, kind))
+            paper = None if published is None else {"galaxies": published.galaxies, "stars": published.stars}[kind]
             rows.append(
                 (f"{name}: detected {kind} / deg2", f"{count / degrees:,.0f}", f"{paper:,.0f}" if paper else "")
             )
         rows.append((f"{name}: flagged objects", f"{(frame['flags'] != 0).mean():.1%}" if len(frame) else "", ""))
         for band in survey.bands(name):
-            paper = PAPER_DEPTHS.get(band)
+            paper = None if published is None else published.depths.get(band)
             rows.append(
                 (
                     f"{band}: 5-sigma depth, AB mag",
@@ -253,7 +238,7 @@ def _lensing(survey: Survey) -> str:
         + table_of(pd.DataFrame(rows))
         + "<p>Troxel et al. (2023), the whole survey: 69 galaxies a square arcminute, 0.247, signal to noise 47.</p>"
         + image_of(
-            pictures.shear(tables),
+            figures.shear(tables),
             "Two-point functions of the true shapes of detected galaxies, with the errors of the Gaussian covariance; "
             "lines: what the input cosmology makes of the sample's redshifts.",
         )
@@ -262,16 +247,16 @@ def _lensing(survey: Survey) -> str:
 
 def _figures_of_the_run(survey: Survey) -> str:
     assert survey.store is not None
-    figures = pd.DataFrame(run_figures(survey.store))
+    table = pd.DataFrame(run_figures(survey.store))
     shown = pd.DataFrame(
         {
-            "stage": figures["stage"],
-            "units": figures["units"],
-            "rows or pixels": figures["rows"],
-            "seconds of work": figures["seconds"].map("{:.1f}".format),
-            "MB uncompressed": (figures["bytes"] / 1e6).map("{:.1f}".format),
-            "peak worker GiB": (figures["peak_bytes"] / 2**30).map("{:.2f}".format),
-            "warnings": figures["warnings"],
+            "stage": table["stage"],
+            "units": table["units"],
+            "rows or pixels": table["rows"],
+            "seconds of work": table["seconds"].map("{:.1f}".format),
+            "MB uncompressed": (table["bytes"] / 1e6).map("{:.1f}".format),
+            "peak worker GiB": (table["peak_bytes"] / 2**30).map("{:.2f}".format),
+            "warnings": table["warnings"],
         }
     )
     disk = bytes_below(survey.store.root)

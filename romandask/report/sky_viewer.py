@@ -21,9 +21,8 @@ from romandask.export.catalogs import prepare
 from romandask.model.errors import UserError
 from romandask.model.sky import from_tangent_plane
 from romandask.model.tiles import tangent_header
-from romandask.products.images import ImageProduct
-from romandask.report.figures import coloured, colours_of_bands, noise_of
-from romandask.stages.coadds.tile_maker import TileMaker, tile_maker, unit_of
+from romandask.report.figures import coloured, noise_of, three_of
+from romandask.stages.coadds.tile_maker import Coadds
 from romandask.storage.paths import write_bytes
 from romandask.survey import Survey
 
@@ -68,61 +67,56 @@ class Plane:
 class Layer:
     """The coadds of one survey, as colours."""
 
-    product: ImageProduct
+    coadds: Coadds
     plane: Plane
-
-    @cached_property
-    def maker(self) -> TileMaker:
-        """What knows the product's tiles."""
-        return tile_maker(self.product)
 
     @cached_property
     def bands(self) -> tuple[str, ...]:
         """The bands that are red, green and blue."""
-        return colours_of_bands(self.maker.instrument.bands)
+        return three_of(self.coadds.instrument.picture_bands)
 
     @property
     def finest(self) -> int:
         """The lowest level: finer pictures would show a pixel as several."""
-        return max(0, int(np.floor(np.log2(self.maker.instrument.coadd_scale / self.plane.scale) + 1e-6)))
+        return max(0, int(np.floor(np.log2(self.coadds.instrument.coadd_scale / self.plane.scale) + 1e-6)))
 
     @cached_property
     def numbers(self) -> dict[int, int]:
         """Numbers of the tiles of which all three bands are stored, by their ids."""
-        found = {tile.id: number for number, tile in enumerate(self.maker.tiles)}
-        return {key: k for key, k in found.items() if all(self.product.has(self.unit(k, b)) for b in self.bands)}
+        found = {tile.id: number for number, tile in enumerate(self.coadds.tiles)}
+        return {key: k for key, k in found.items() if all(self.coadds.has(self.unit(k, b)) for b in self.bands)}
 
     @cached_property
     def noise(self) -> dict[str, float]:
         """Scatter of the sky by band, from the middle of a tile."""
         middle = sorted(self.numbers.values())[len(self.numbers) // 2]
-        first = max(0, (self.maker.pixels - _SAMPLE) // 2)
+        first = max(0, (self.coadds.pixels - _SAMPLE) // 2)
         window = (slice(first, first + _SAMPLE),) * 2
-        return {b: noise_of(self.product.load(self.unit(middle, b), ("image",), window)["image"]) for b in self.bands}
+        return {b: noise_of(self.coadds.load(self.unit(middle, b), ("image",), window)["image"]) for b in self.bands}
 
     def unit(self, tile: int, band: str) -> int:
         """Return the number of the unit of a tile and band."""
-        return unit_of(tile, band, self.maker.instrument.bands)
+        return self.coadds.index(tile, band)
 
     def sampled(self, row: int, column: int) -> np.ndarray:
         """Return a picture (3, side, side) of the finest level in units of the noise; NaN where nothing is."""
         ra, dec = self.plane.sky(self.finest, row, column)
-        owners = self.maker.settings.grid().owner(ra, dec)
+        owners = self.coadds.settings.grid().owner(ra, dec)
         out = np.full((3, *ra.shape), np.nan, np.float32)
         for owner in np.unique(owners).tolist():
             if owner not in self.numbers:
                 continue
             here = owners == owner
             tile = self.numbers[owner]
-            x, y = (np.rint(v).astype(int) for v in self.maker.wcs(tile).wcs_world2pix(ra[here], dec[here], 0))
-            inside = (x >= 0) & (y >= 0) & (x < self.maker.pixels) & (y < self.maker.pixels)
+            x, y = (np.rint(v).astype(int) for v in self.coadds.wcs(tile).wcs_world2pix(ra[here], dec[here], 0))
+            inside = (x >= 0) & (y >= 0) & (x < self.coadds.pixels) & (y < self.coadds.pixels)
             if not inside.any():
                 continue
             x, y, places = x[inside], y[inside], np.flatnonzero(here)[inside]
             window = slice(y.min(), y.max() + 1), slice(x.min(), x.max() + 1)
             # where there are few bands one is two colours, and read once
             for band, noise in self.noise.items():
-                found = self.product.load(self.unit(tile, band), ("image", "weight"), window)
+                found = self.coadds.load(self.unit(tile, band), ("image", "weight"), window)
                 values = np.where(found["weight"] > 0, found["image"] / noise, np.nan)
                 for plane in (plane for plane, name in zip(out, self.bands, strict=True) if name == band):
                     plane.flat[places] = values[y - window[0].start, x - window[1].start]

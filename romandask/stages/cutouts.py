@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import dask
 import dask.array as da
@@ -12,26 +13,14 @@ import pandas as pd
 import xarray as xr
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import exposure_of
-from romandask.kernels.detectors.simple_detector import NO_DATA, usable
-from romandask.kernels.rendering.psf import fine_image
+from romandask.kernels.detectors.simple_detector import NO_DATA
 from romandask.kernels.rendering.scene import pixel_positions
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
-from romandask.stages.coadds.tile_maker import TileMaker
-from romandask.stages.exposures import RenderExposure, empty_variance
-from romandask.stages.pointings import corners_of
-from romandask.stages.psf_images import flat_shares
 from romandask.storage.manifest import digest
 
-EXPOSURE_LAYERS = {
-    "background": ("float32", "electron", "expected electrons that do not come from objects"),
-    "weight": ("float32", "1/electron2", "inverse variance of an empty pixel; 0 where dq forbids it"),
-    "psf": ("float32", "1/pixel", "unit star, flat f_nu, at the object's place, centred on pixel size // 2"),
-}
-"""Layers of exposures beside those that are stored: dtype, unit, what they hold."""
 LARGEST_CUTOUT_PIXELS = 256
 """Pixels a side of the largest cutouts."""
 _EDGE = 1.0
@@ -58,19 +47,37 @@ class Positions:
         return rows[[self.id, self.ra, self.dec]].set_axis(["id", "ra", "dec"], axis=1)
 
 
-@dataclass(frozen=True)
-class Frames:
-    """Images of one product, in the order of its units, with all that cutouts need to know of them."""
+class Images(Protocol):
+    """Images of exposures or coadds, and what cutouts need to know of them."""
 
     product: ImageProduct
-    footprints: np.ndarray
-    """(frames, 4, 2) corners, degrees."""
-    shape: tuple[int, int]
-    """(ny, nx)"""
-    header: Callable[[int], dict]
-    """The WCS of a unit."""
-    bands: np.ndarray
-    """(frames,)"""
+
+    @property
+    def footprints(self) -> np.ndarray:
+        """(n, 4, 2) corners of the images, degrees."""
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """(ny, nx) of an image."""
+
+    @property
+    def unit_bands(self) -> np.ndarray:
+        """(n,) band of each image."""
+
+    @property
+    def extra_layers(self) -> dict[str, tuple[str, str, str]]:
+        """Layers beside the stored arrays: dtype, unit, description."""
+
+    def header(self, index: int) -> dict:
+        """Return the FITS header of the WCS of an image."""
+
+    def make_layers(
+        self, index: int, wanted: Sequence[str], window: tuple[slice, slice], arrays: dict[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Return the layers of a window of an image that are not stored, but for `psf`."""
+
+    def make_psfs(self, index: int, positions: np.ndarray, size: int) -> np.ndarray:
+        """Return the PSF (n, size, size) at positions (n, 2), pixels, of an image."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def located(of: Wanted, tables: Sequence[Positions], catalog: str) -> pd.DataFra
 
 
 def cutouts(
-    product: ImageProduct,
+    images: Images,
     objects: pd.DataFrame,
     layers: tuple[str, ...] = ("image",),
     bands: tuple[str, ...] | None = None,
@@ -135,7 +142,7 @@ def cutouts(
 
     Parameters
     ----------
-    product : what `exposures()` or `coadds()` returned
+    images : Exposures or Coadds
     objects : columns id, ra, dec (degrees)
     layers : of the product's own, and for exposures also `background`, `weight`, `psf`
     bands : those of the images; None for all
@@ -146,32 +153,31 @@ def cutouts(
     UserError
         If a layer, a band or the size is not possible.
     """
-    frames = _frames(product)
-    known = sorted(set(frames.bands.tolist()))
+    product, unit_bands = images.product, images.unit_bands
+    known = sorted(set(unit_bands.tolist()))
     for band in bands or ():
         if band not in known:
             raise UserError(f"band {band!r}: the images have {', '.join(known)}")
     if not 8 <= size <= LARGEST_CUTOUT_PIXELS or size % 2:
         raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST_CUTOUT_PIXELS}")
-    chosen = np.flatnonzero(np.isin(frames.bands, bands or known))
+    chosen = np.flatnonzero(np.isin(unit_bands, bands or known))
     planes = {v.name: (v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
-    if isinstance(product.make, RenderExposure):
-        planes |= {name: (kind, {"units": u, "long_name": t}) for name, (kind, u, t) in EXPOSURE_LAYERS.items()}
+    planes |= {name: (kind, {"units": u, "long_name": t}) for name, (kind, u, t) in images.extra_layers.items()}
     for layer in layers:
         if layer not in planes:
             raise UserError(f"layer {layer!r}: {product.stage} has {', '.join(planes)}")
-    return _dataset(frames, find(frames, chosen, objects, size), objects, {n: planes[n] for n in layers}, size)
+    return _dataset(images, find(images, chosen, objects, size), objects, {n: planes[n] for n in layers}, size)
 
 
-def find(frames: Frames, chosen: np.ndarray, objects: pd.DataFrame, size: int) -> Places:
+def find(images: Images, chosen: np.ndarray, objects: pd.DataFrame, size: int) -> Places:
     """Return where objects are on the chosen frames that see their centres."""
     ra, dec = objects["ra"].to_numpy(float), objects["dec"].to_numpy(float)
-    ny, nx = frames.shape
-    which, point = covering_pairs(frames.footprints[chosen], ra, dec, _EDGE)
+    ny, nx = images.image_shape
+    which, point = covering_pairs(images.footprints[chosen], ra, dec, _EDGE)
     numbers, starts = np.unique(which, return_index=True)
     found: list[tuple[np.ndarray, ...]] = []
     for number, rows in zip(numbers, np.split(point, starts)[1:], strict=True):
-        header = frames.header(int(chosen[number]))
+        header = images.header(int(chosen[number]))
         x, y, to_pixels = pixel_positions(WCS(header), ra[rows], dec[rows])
         inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
         rows, x, y, to_pixels = rows[inside], x[inside], y[inside], to_pixels[inside]
@@ -184,40 +190,18 @@ def find(frames: Frames, chosen: np.ndarray, objects: pd.DataFrame, size: int) -
     return Places(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _frames(product: ImageProduct) -> Frames:
-    """Return the images of exposures or coadds."""
-    maker = product.make
-    if isinstance(maker, RenderExposure):
-        table, instrument = maker.table, maker.instrument
-
-        def of_exposure(unit: int) -> dict:
-            return instrument.header(exposure_of(table.iloc[unit]))
-
-        return Frames(product, corners_of(table), instrument.shape, of_exposure, table["band"].to_numpy(object))
-    if isinstance(maker, TileMaker):
-        bands, side = maker.instrument.bands, maker.settings.grid().side
-
-        def of_tile(unit: int) -> dict:
-            return maker.header(unit // len(bands))
-
-        corners = np.repeat(np.stack([tile.corners(side) for tile in maker.tiles]), len(bands), axis=0)
-        shape = (maker.pixels, maker.pixels)
-        return Frames(product, corners, shape, of_tile, np.array(bands * len(maker.tiles), object))
-    raise TypeError("cutouts need the product that exposures() or coadds() returns")
-
-
 def _dataset(
-    frames: Frames, places: Places, objects: pd.DataFrame, layers: dict[str, tuple[str, dict]], size: int
+    images: Images, places: Places, objects: pd.DataFrame, layers: dict[str, tuple[str, dict]], size: int
 ) -> xr.Dataset:
     """Return the lazy arrays with the coordinates of every cutout."""
-    product, axes = frames.product, ("cutout",)
+    product, axes = images.product, ("cutout",)
     used, counts = np.unique(places.frame, return_counts=True)
     data = {}
     if len(used):
         settings = [product.units[unit].settings for unit in used.tolist()]
         token = digest(product.stage, places.frame, places.x, places.y, size, sorted(layers), settings)
         name = f"{product.stage.replace('/', '-')}-cutouts-{token}"
-        source = dask.delayed(Cut(product, used, _per_frame(places, used), tuple(layers), size), name=name)
+        source = dask.delayed(Cut(images, used, _per_frame(places, used), tuple(layers), size), name=name)
         bundles = da.map_blocks(
             _cut_block, source, chunks=((1,) * len(used),), dtype=object, meta=np.empty(0, object), name=f"{name}-unit"
         )
@@ -247,7 +231,7 @@ def _dataset(
         "ra": (axes, objects["ra"].to_numpy(float)[places.row], degrees),
         "dec": (axes, objects["dec"].to_numpy(float)[places.row], degrees),
         "unit": (axes, unit_names.astype(str), {"description": "image: exposure, or tile and band"}),
-        "band": (axes, frames.bands[places.frame].astype(str), {}),
+        "band": (axes, images.unit_bands[places.frame].astype(str), {}),
         "x_image": (axes, places.x, pixel),
         "y_image": (axes, places.y, pixel),
         "column": (axes, places.corner[:, 0], first),
@@ -268,7 +252,7 @@ def _per_frame(places: Places, used: np.ndarray) -> tuple[tuple[np.ndarray, np.n
 class Cut:
     """Cuts the squares of one image."""
 
-    product: ImageProduct
+    images: Images
     units: np.ndarray
     """(images,) number of each in the product."""
     places: tuple[tuple[np.ndarray, np.ndarray], ...]
@@ -279,8 +263,8 @@ class Cut:
     def __call__(self, number: int) -> dict[str, np.ndarray]:
         """Return the layers (n, size, size) of an image."""
         unit, (at, corners) = int(self.units[number]), self.places[number]
-        maker = self.product.make
-        own = {v.name: v.shape[-2:] for v in self.product.variables if v.axes[-2:] == ("y", "x")}
+        product = self.images.product
+        own = {v.name: v.shape[-2:] for v in product.variables if v.axes[-2:] == ("y", "x")}
         shape = next(iter(own.values()))
         low = np.clip(corners.min(axis=0), 0, np.array(shape[::-1]))
         high = np.clip(corners.max(axis=0) + self.size, 0, np.array(shape[::-1]))
@@ -288,38 +272,16 @@ class Cut:
         wanted = {name for name in self.layers if name in own}
         if "weight" in self.layers:
             wanted |= {"dq", "image", "variance"}
-        arrays = self.product.load(unit, tuple(sorted(wanted & set(own))), window) if wanted else {}
+        arrays = product.load(unit, tuple(sorted(wanted & set(own))), window) if wanted else {}
         # of planes that there are several of, noise realisations, the first
         arrays = {name: plane if plane.ndim == 2 else plane[0] for name, plane in arrays.items()}
-        made = {}
-        if isinstance(maker, RenderExposure):
-            arrays |= self._expected(maker, unit, window, arrays)
-            if "psf" in self.layers:
-                made["psf"] = self._stars(maker, unit, at)
+        arrays |= self.images.make_layers(unit, self.layers, window, arrays)
+        made = {"psf": self.images.make_psfs(unit, at, self.size)} if "psf" in self.layers else {}
         for name in self.layers:
             if name != "psf":
                 outside = NO_DATA if name == "dq" else 0
                 made[name] = squares(arrays[name], corners - low, self.size, outside)
         return made
-
-    def _expected(
-        self, maker: RenderExposure, unit: int, window: tuple[slice, slice], arrays: dict[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
-        """Return background and weight of a window of an exposure, where they are wanted."""
-        if not {"background", "weight"} & set(self.layers):
-            return {}
-        exposure, instrument = exposure_of(maker.table.iloc[unit]), maker.instrument
-        background = instrument.background(exposure, instrument.header(exposure), *window)
-        if "weight" not in self.layers:
-            return {"background": background}
-        variance = empty_variance(arrays, background, instrument.detector)
-        return {"background": background, "weight": np.where(usable(arrays["dq"]), 1 / variance, np.float32(0))}
-
-    def _stars(self, maker: RenderExposure, unit: int, at: np.ndarray) -> np.ndarray:
-        """Return the PSF (n, size, size) at places of an exposure."""
-        exposure, instrument = exposure_of(maker.table.iloc[unit]), maker.instrument
-        psf, shares = instrument.psf(exposure), flat_shares(instrument.bandpass(exposure.band))
-        return np.stack([fine_image(psf, shares, x, y, self.size, 1) for x, y in at]).astype(np.float32)
 
 
 def squares(image: np.ndarray, corners: np.ndarray, size: int, outside: float) -> np.ndarray:

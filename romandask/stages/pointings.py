@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from romandask.ingest import obseq, opsim
-from romandask.instruments.instrument import EXPOSURE_COLUMNS, Instrument
+from romandask.instruments.exposure import EXPOSURE_COLUMNS
+from romandask.instruments.instrument import Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, chord, touching_pairs, unit_vectors
 from romandask.model.tiles import Tile

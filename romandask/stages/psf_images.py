@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from romandask.instruments.instrument import Exposure, Instrument, exposure_of
+from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.rendering.psf import fine_image
-from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.images import ImageProduct
 from romandask.products.units import LazyUnits, Unit
-from romandask.stages.exposures import RenderExposure
+from romandask.stages.exposures.exposures import Exposures, flat_shares
+from romandask.stages.exposures.render import RenderExposure
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 from romandask.storage.arrays import Variable
 
@@ -21,17 +22,15 @@ PSF_IMAGE_PIXELS = 64
 """Native pixels that an image covers."""
 
 
-def psfs(exposures: ImageProduct) -> ImageProduct:
+def psfs(exposures: Exposures) -> ImageProduct:
     """Return the lazy PSF images of a survey's exposures: dims (exposure, v, u), coordinates those of the exposures.
 
     Each is the PSF in the middle of the detector of a star of flat f_nu (Troxel et al. 2023, section 5.2), 8 samples a
     pixel, its centre on sample 256 of both axes. A sample is the share of the star's light in a native pixel
     centred there: every eighth sample sums to one but for the light beyond the edge.
     """
-    source = exposures.make
-    if not isinstance(source, RenderExposure):
-        raise TypeError("PSF images need the product that exposures() returns")
-    instrument, every = source.instrument, exposures.units
+    renderer, images, every = exposures.renderer, exposures.product, exposures.units
+    instrument = renderer.instrument
     side = PSF_IMAGE_PIXELS * OVERSAMPLING
 
     def unit(row: int) -> Unit:
@@ -48,11 +47,11 @@ def psfs(exposures: ImageProduct) -> ImageProduct:
     return ImageProduct(
         f"psfs/{instrument.name}",
         LazyUnits(exposures.names, unit),
-        MakePsf(source),
+        MakePsf(renderer),
         (Variable("psf", "float32", (side, side), ("v", "u"), text),),
-        exposures.axes,
-        exposures.lengths,
-        exposures.coordinates,
+        images.axes,
+        images.lengths,
+        images.coordinates,
         {"survey": instrument.name},
         bytes_per_unit=350 << 20,
         seconds_per_unit=0.7,
@@ -84,12 +83,6 @@ def psf_image(
     bandpass = instrument.bandpass(exposure.band)
     shares = flat_shares(bandpass) if shares is None else np.asarray(shares, float) / np.sum(shares)
     return fine_image(instrument.psf_at(exposure, x, y), shares, x, y, PSF_IMAGE_PIXELS, OVERSAMPLING)
-
-
-def flat_shares(bandpass: Bandpass) -> np.ndarray:
-    """Return the share of the photons of a source of flat f_nu that goes to each PSF node of a band."""
-    photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
-    return photons / photons.sum()
 
 
 PSF_IMAGES = Stage(

@@ -8,32 +8,30 @@ import numpy as np
 import pandas as pd
 
 from romandask.kernels.rendering.scene import OFF_IMAGE
-from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import LazyUnits, Unit
-from romandask.stages.exposures import RenderExposure, View, has_exposures
+from romandask.stages.exposures.exposures import Exposures, has_exposures
+from romandask.stages.exposures.render import RenderExposure, View
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 
-def truth_index(exposures: ImageProduct) -> TableProduct:
+def truth_index(exposures: Exposures) -> TableProduct:
     """Return the lazy index of a survey's exposures (schema: catalogs/truth_index.yaml), a unit an exposure.
 
     It depends on what its exposure depends on, and is made without drawing it.
     """
-    source = exposures.make
-    if not isinstance(source, RenderExposure):
-        raise TypeError("a truth index needs the product that exposures() returns")
+    renderer = exposures.renderer
 
     def unit(row: int) -> Unit:
         return exposures.units[row]
 
     return TableProduct(
-        f"truth_index/{source.instrument.name}",
+        f"truth_index/{renderer.instrument.name}",
         LazyUnits(exposures.names, unit),
-        MakeIndex(source),
+        MakeIndex(renderer),
         schema("truth_index"),
-        bytes_per_unit=int(np.prod(source.instrument.shape)) * 16 + (520 << 20),
+        bytes_per_unit=int(np.prod(renderer.instrument.shape)) * 16 + (520 << 20),
         seconds_per_unit=1.2,
     )
 

@@ -14,7 +14,7 @@ import galsim
 import galsim.roman
 import numpy as np
 
-from romandask.instruments.instrument import Exposure
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.calibration import calibrations
 from romandask.instruments.roman.calibration_source import CalibrationSource
 from romandask.instruments.roman.roman import Roman, RomanSettings
@@ -59,7 +59,7 @@ def run(folder: Path) -> None:
     print(f"calibrations made {time.perf_counter() - start:6.2f} s  once an SCA")
     write_record(store, Record(product.stage, product.names[0], "", "", 0, 0, 0.0, 0))
     roman = Roman(RomanSettings(detector="sca"), 5, source)
-    readout = ScaReadout(roman, product.stored(store), SEED)
+    readout = ScaReadout(roman, product.stored(store), SEED, cosmic_rays=False)
     exposure = Exposure(1, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 0.0)
     planes = readout.planes(exposure)
     response = readout.response(exposure, planes)

@@ -17,7 +17,7 @@ import numpy as np
 from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 
-from romandask.instruments.instrument import Exposure
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips

@@ -123,7 +123,9 @@ def whole_survey() -> None:
         for name, table in tables.items():
             seconds, rows, _ = run(table)
             print(f"{name}: {rows} objects in {len(cells)} partitions, made in {seconds:.0f} s (not counted)")
-        made = matches({name: table.stored(store) for name, table in tables.items()}, MatchSettings(), REGION, store)
+        samples = {name: table.stored(store) for name, table in tables.items()}
+        codes = {name: code for code, name in enumerate(tables)}
+        made = matches(samples, codes, MatchSettings(), REGION, store)
         total = 0.0
         for product in vars(made).values():
             seconds, rows, peak = run(product)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import galsim
@@ -16,14 +17,15 @@ import galsim.roman
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.fourier import POINT
 from romandask.kernels.rendering.galsim_engine import object_profile
 from romandask.model.settings import RenderSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.stages.exposures import RenderExposure, View, exposures
+from romandask.stages.exposures.exposures import exposures
+from romandask.stages.exposures.render import RenderExposure, View
 from romandask.stages.pointings import CORNERS
 from romandask.stages.truth.catalogs import truth
 
@@ -50,8 +52,7 @@ def full_density(roman: Roman) -> RenderExposure:
                 self.rows = near(*cones)
             return self.rows
 
-    source = exposures(pd.DataFrame([row]), catalogs, roman, RenderSettings(), RNG).make
-    return RenderExposure(source.table, Once(), roman, source.render, RNG)
+    return replace(exposures(pd.DataFrame([row]), catalogs, roman, RenderSettings(), RNG).renderer, truth=Once())
 
 
 def seconds(work, repeat: int = 3):

@@ -17,7 +17,7 @@ from mocpy import MOC
 
 from romandask.export.images import export_fits, export_moc, export_obscore
 from romandask.export.roman_datamodels import export_asdf, export_mosaics
-from romandask.instruments.instrument import exposure_of
+from romandask.instruments.exposure import exposure_of
 from romandask.model.errors import UserError
 from romandask.stages.pointings import corners_of
 from romandask.survey import open_survey

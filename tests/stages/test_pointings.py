@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 
 from romandask.ingest import obseq, opsim
-from romandask.instruments.instrument import exposure_of, footprint
+from romandask.instruments.exposure import exposure_of, footprint
 from romandask.instruments.roman.roman import Roman, RomanPointings, RomanSettings
 from romandask.instruments.roman.sun import best_roll
 from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings, detector_centres

@@ -8,7 +8,7 @@ import pytest
 from astropy.wcs import WCS
 
 from romandask.kernels.rendering.scene import BAD_FLUX, BAD_LENSING, BAD_SIZE, NO_PLACE
-from romandask.stages.exposures import RenderExposure
+from romandask.stages.exposures.render import RenderExposure
 from romandask.stages.truth_index import truth_index
 
 
@@ -50,7 +50,7 @@ def test_the_flux_of_what_is_drawn_is_in_the_image(small, index):
 
 
 def test_what_cannot_be_drawn_has_its_reason_and_no_pixel(small, index):
-    source: RenderExposure = small.product.make
+    source: RenderExposure = small.product.renderer
     wrong = {
         "size_disk_true": (np.nan, BAD_SIZE),
         "size_minor_disk_true": (-0.1, BAD_SIZE),

@@ -95,6 +95,11 @@ VARIABLES = (
 that are known; float16 (11 bits) where what it describes is itself known, or acts, no better than to a per cent."""
 
 
+def unit_name(sca: int) -> str:
+    """Return the name of the unit of an SCA."""
+    return f"sca{sca:02d}"
+
+
 def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct:
     """Return the lazy calibrations of some SCAs: dims (sca, ...), one variable an extension of the paper's table 1.
 
@@ -106,7 +111,7 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
         If a file is missing, or not laid out as it should be.
     """
     source.check(scas)
-    units = tuple(Unit(f"sca{sca:02d}", {"sca": sca, "source": source.state(sca)}) for sca in scas)
+    units = tuple(Unit(unit_name(sca), {"sca": sca, "source": source.state(sca)}) for sca in scas)
 
     def coordinates() -> Coordinates:
         return {

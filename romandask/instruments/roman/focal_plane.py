@@ -14,7 +14,7 @@ import galsim
 import galsim.roman
 import numpy as np
 
-from romandask.instruments.instrument import footprint
+from romandask.instruments.exposure import footprint
 from romandask.model.sky import radec, unit_vectors
 
 SCAS = tuple(range(1, galsim.roman.n_sca + 1))

@@ -14,12 +14,11 @@ import galsim.roman
 import numpy as np
 from galsim.roman import roman_psfs
 
+from romandask.instruments.roman.bands import BANDS
 from romandask.kernels.rendering.diffraction import Pupil, diffraction
 from romandask.kernels.rendering.psf import CORE, Grid, PsfModel, Variation, edge_brightness, model, place_grid
 from romandask.kernels.universe.bandpasses import roman_bandpass
 
-FOLDS = {"Y106": 3, "J129": 3, "H158": 2, "F184": 2}
-"""How many times the pixels' Nyquist frequency the optics reach in each band."""
 PSF_EXTENT_PIXELS = 4096
 """Pixels, a side, that a PSF of the unbinned pupil covers; one of a binned pupil covers so many times less."""
 ACTIVE_PIXELS = galsim.roman.n_pix
@@ -105,7 +104,7 @@ def _aberrations(sca: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @lru_cache(maxsize=128)
 def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, float]:
     """Return how bright a unit star is at the edges of stamps: the brighter of the band's ends."""
-    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(PSF_EXTENT_PIXELS // 8, FOLDS[band])
+    waves, grid = roman_bandpass(band, n_waves).nodes, Grid(PSF_EXTENT_PIXELS // 8, BANDS[band].frequency_folds)
     return edge_brightness(transforms(sca, band, waves[[0, -1]], 8, MIDDLE, grid, diffusion), grid)
 
 
@@ -114,7 +113,7 @@ def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, floa
 def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     """Return the PSF of an SCA and band, as it varies over the SCA by polynomials of a degree; 0: it does not."""
     waves, lens = roman_bandpass(band, n_waves).nodes, pupil(sca, band, 8)
-    grid, core = Grid(PSF_EXTENT_PIXELS // 8, FOLDS[band]), Grid(CORE, FOLDS[band])
+    grid, core = Grid(PSF_EXTENT_PIXELS // 8, BANDS[band].frequency_folds), Grid(CORE, BANDS[band].frequency_folds)
     places = place_grid((ACTIVE_PIXELS, ACTIVE_PIXELS), degree) if degree else np.empty((0, 2))
     nodes = transforms(sca, band, waves, 8, MIDDLE, grid, diffusion)
     differences = np.empty((n_waves, len(places), *core.shape), np.complex64)

@@ -19,6 +19,7 @@ import galsim.roman
 import numpy as np
 import pandas as pd
 
+from romandask.instruments.roman.bands import BANDS
 from romandask.instruments.roman.focal_plane import corners, move, separations
 from romandask.instruments.roman.sun import FURTHEST, LARGEST_ROLL, NEAREST, best_roll, leads, roll_offset, sun_angle
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses
@@ -36,10 +37,6 @@ SLEWS = (0.0, 0.0319, 0.327, 0.347, 0.456, 0.490, 0.774, 0.935, 1.017, 1.257, 1.
 """Slews, degrees, that take CADENCE seconds: medians of the mission's observing sequence (the first is assumed)."""
 CADENCE = (169.7, 169.7, 198.6, 200.3, 206.8, 208.2, 221.9, 228.2, 230.1, 239.0, 248.2, 300.0, 334.3, 413.2)
 """From the start of an exposure to the start of the next one after a slew, seconds."""
-ROLLS = {"Y106": -9.0, "J129": -3.0, "H158": 3.0, "F184": 9.0}
-"""Difference from the best roll, degrees: tiles of different bands are turned against each other."""
-LOW_ZODIACAL = ("Y106", "J129", "H158")
-"""Bands that choose their dates by zodiacal light; the others take the remaining time."""
 SECTOR = 3.0
 """Largest side of a sector, degrees."""
 OVERLAP = 0.05
@@ -90,7 +87,7 @@ def reference_plan(
     blocks = []
     for number in range(max(len(dithers[band]) for band in bands)):
         # bands that need the dark dates choose first
-        for band in sorted(bands, key=lambda name: name not in LOW_ZODIACAL):
+        for band in sorted(bands, key=lambda name: not BANDS[name].low_zodiacal):
             count = dithers[band][number] if number < len(dithers[band]) else 0
             for sector in sectors if count else ():
                 block = _observe(sector, band, number, count, start, busy)
@@ -156,7 +153,7 @@ def _dates(sector: Sector, band: str, leading: bool, start: float) -> np.ndarray
     """Return the days (MJD) of a year from `start` on which a sector can be observed, the best ones first."""
     days = start + np.arange(365.0)
     ra, dec = sector.box.centre
-    pa = best_roll(ra, dec, days) + ROLLS.get(band, 0.0)
+    pa = best_roll(ra, dec, days) + BANDS[band].roll
     around = np.radians(np.arange(0, 360, 30))
     radius = _radius(sector)
     ring = move(ra, dec, pa[:, None], np.append(radius * np.sin(around), 0), np.append(radius * np.cos(around), 0))
@@ -164,7 +161,7 @@ def _dates(sector: Sector, band: str, leading: bool, start: float) -> np.ndarray
     off = roll_offset(*ring, days[:, None])
     good = ((angle > NEAREST + ROOM) & (angle < FURTHEST - ROOM) & (np.abs(off) < LARGEST_ROLL - ROOM)).all(axis=1)
     days = days[good & (leads(ra, dec, days) == leading)]
-    if band not in LOW_ZODIACAL:
+    if not BANDS[band].low_zodiacal:
         return days
     place = galsim.CelestialCoord(ra * galsim.degrees, dec * galsim.degrees)
     bandpass = galsim_roman_bandpasses()[band]
@@ -193,7 +190,7 @@ def _allowed(block: pd.DataFrame) -> bool:
 def _block(sector: Sector, band: str, number: int, count: int, mjd: float) -> pd.DataFrame:
     """Return the visits of one band and pass of a sector from a time on: strips of dithered fields, to and fro."""
     ra, dec = sector.box.centre
-    pa = float(best_roll(ra, dec, mjd)) + ROLLS.get(band, 0.0)
+    pa = float(best_roll(ra, dec, mjd)) + BANDS[band].roll
     strips, lines = (int(np.ceil((_radius(sector) + step) / step)) for step in (LONG_STEP, SHORT_STEP))
     i, j = (values.ravel() for values in np.mgrid[-strips : strips + 1, -lines : lines + 1])
     # the second pass is shifted by half a tile, so that edges and gaps of the two do not coincide

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import galsim
 import galsim.roman
@@ -13,13 +13,20 @@ import numpy as np
 import pandas as pd
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
-from romandask.instruments.instrument import WHOLE, Exposure, pixel_areas
+from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
+from romandask.instruments.instrument import (
+    InstrumentContext,
+    InstrumentSettings,
+    Light,
+    Publication,
+    Readout,
+)
+from romandask.instruments.roman.bands import BANDS, COLOUR_BAND, REFERENCE_BAND
 from romandask.instruments.roman.calibration import calibrations
 from romandask.instruments.roman.calibration_source import CalibrationSource
 from romandask.instruments.roman.focal_plane import SCAS, corners, header_of
 from romandask.instruments.roman.optics import (
     ACTIVE_PIXELS,
-    FOLDS,
     MIDDLE,
     PSF_EXTENT_PIXELS,
     WideNodes,
@@ -29,19 +36,32 @@ from romandask.instruments.roman.optics import (
     transforms,
 )
 from romandask.instruments.roman.plan import reference_plan
+from romandask.instruments.roman.sca_effects import effect_images
+from romandask.instruments.roman.sca_readout import ScaReadout
 from romandask.instruments.roman.sun import FURTHEST, NEAREST, sun_angle
+from romandask.instruments.simple_readout import SimpleReadout
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, Grid, PsfModel, model
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass
-from romandask.model.settings import Section, distinct
+from romandask.model.settings import Section, distinct, one_of
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
+from romandask.storage.paths import resolve_below
 
 _NEAR = 256
 """Pixels, a side, that the PSF of one place covers."""
 KNOT_SMOOTHING = 0.2
 """Sigma, arcsec, of the Gaussian that smooths each knot (paper, section 3)."""
+
+
+PUBLICATION = Publication(
+    source="Troxel et al. 2023",
+    depths={name: band.depth for name, band in BANDS.items() if band.depth is not None},
+    # of its 1039 tiles' unique areas
+    galaxies=12_432_713 / (1039 * 0.125**2),
+    stars=215_613 / (1039 * 0.125**2),
+)
 
 
 class RomanPointings(Section):
@@ -51,16 +71,18 @@ class RomanPointings(Section):
     path: str | None = Field(None, description="obseq FITS file, below `data`")
     start: float = Field(61541.0, ge=51544, le=88069, description="first day of the plan, MJD (years 2000 to 2100)")
     dithers: dict[str, tuple[NonNegativeInt, ...]] = Field(
-        {"Y106": (4, 3), "J129": (4, 4), "H158": (4, 3), "F184": (4, 3)},
+        {name: band.dithers for name, band in BANDS.items()},
         description="dithers at every field, for each pass, by band",
     )
 
 
-class RomanSettings(Section):
+class RomanSettings(InstrumentSettings):
     """The Roman block of a pipeline."""
 
-    bands: Annotated[tuple[Literal["Y106", "J129", "H158", "F184"], ...], AfterValidator(distinct)] = Field(
-        ("Y106", "J129", "H158", "F184"), min_length=1
+    every_band: ClassVar[tuple[str, ...]] = tuple(BANDS)
+    usual_reference_band: ClassVar[str] = REFERENCE_BAND
+    bands: Annotated[tuple[Annotated[str, AfterValidator(one_of(BANDS))], ...], AfterValidator(distinct)] = Field(
+        tuple(BANDS), min_length=1
     )
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple", "sca"] = Field(
@@ -99,6 +121,14 @@ class RomanSettings(Section):
             raise ValueError(f"pointings.dithers has no exposures for {', '.join(missing)}")
         return self
 
+    def instrument(self, context: InstrumentContext) -> Roman:
+        """Return Roman with these settings."""
+        source = None
+        if self.detector == "sca":
+            folder = None if self.calibration is None else resolve_below(context.data, self.calibration)
+            source = CalibrationSource(folder, context.seed)
+        return Roman(self, context.n_waves, source)
+
 
 @dataclass(frozen=True)
 class Roman:
@@ -109,6 +139,14 @@ class Roman:
     calibration: CalibrationSource | None = None
     """With settings.detector: sca."""
     name: str = "roman"
+    title: str = "Roman"
+    facility: tuple[str, str] = ("Roman Space Telescope", "WFI")
+    code: int = 0
+    blend_role: Literal["sharp"] = "sharp"
+    publication: Publication = PUBLICATION
+    data_model_elements: Mapping[str, str] = field(
+        default_factory=lambda: {name: band.optical_element for name, band in BANDS.items()}, compare=False
+    )
     coadd_scale: float = 0.0575
     """arcsec"""
     pixel_scale: float = galsim.roman.pixel_scale
@@ -121,11 +159,27 @@ class Roman:
     detection_bands: tuple[str, ...] | None = None
     coadd: Literal["drizzle"] = "drizzle"
     detector: Detector = Detector(saturation=1e5, read_noise=galsim.roman.read_noise)
+    visit_seconds: float = 139.8
 
     @property
     def bands(self) -> tuple[str, ...]:
         """Bands of this pipeline."""
         return self.settings.bands
+
+    @property
+    def reference_band(self) -> str:
+        """H158, or the middle one of this pipeline's bands."""
+        return REFERENCE_BAND if REFERENCE_BAND in self.bands else self.bands[len(self.bands) // 2]
+
+    @property
+    def colour_band(self) -> str:
+        """F184, or the reference band."""
+        return COLOUR_BAND if COLOUR_BAND in self.bands else self.reference_band
+
+    @property
+    def picture_bands(self) -> tuple[str, ...]:
+        """Bands of this pipeline from red to blue."""
+        return tuple(band for band in reversed(BANDS) if band in self.bands)
 
     @property
     def psf_settings(self) -> dict[str, object]:
@@ -141,6 +195,22 @@ class Roman:
     def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
         """Return the lazy calibrations of some SCAs, with the full model of the detectors."""
         return None if self.calibration is None else calibrations(self.calibration, detectors)
+
+    def readout(self, seed: int, calibration: ImageProduct | None) -> Readout:
+        """Return the simple detector, or with calibrations every effect of the SCAs."""
+        if calibration is None:
+            return SimpleReadout(self.name, self.detector, self.shape, seed)
+        return ScaReadout(self, calibration, seed, self.settings.cosmic_rays)
+
+    def effects(
+        self,
+        readout: Readout,
+        light: Light,
+        expected: np.ndarray,
+        left: Sequence[tuple[Exposure, pd.DataFrame]],
+    ) -> dict[str, np.ndarray]:
+        """Return what each effect of an SCA does around the brightest object, in the order in which they act."""
+        return effect_images(readout, light, expected, left) if isinstance(readout, ScaReadout) else {}
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""
@@ -178,7 +248,7 @@ class Roman:
         """Return the PSF at one place of the SCA, on stamps of up to 256 pixels."""
         if not self.settings.psf_degree:
             x, y = MIDDLE
-        grid, diffusion = Grid(_NEAR, FOLDS[exposure.band]), self.diffusion(exposure.detector)
+        grid, diffusion = Grid(_NEAR, BANDS[exposure.band].frequency_folds), self.diffusion(exposure.detector)
         waves = self.bandpass(exposure.band).nodes
         return model(transforms(exposure.detector, exposure.band, waves, 8, (x, y), grid, diffusion), grid)
 
@@ -201,7 +271,7 @@ class Roman:
             place = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
             shares = np.clip(1 - np.abs(place[:, None] - np.arange(len(waves))), 0, 1)
             # of the finest frequencies in the shortest band their cores alone have any
-            grid = Grid(PSF_EXTENT_PIXELS // pupil_bin, FOLDS[exposure.band] if pupil_bin == 4 else 2)
+            grid = Grid(PSF_EXTENT_PIXELS // pupil_bin, BANDS[exposure.band].frequency_folds if pupil_bin == 4 else 2)
             nodes = WideNodes(exposure.detector, exposure.band, tuple(waves), pupil_bin, grid, diffusion)
             found.append(BrightPsf(zero * 10 ** (-0.4 * magnitude), grid, nodes, shares))
         return tuple(found)
@@ -231,6 +301,14 @@ class Roman:
     def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
         """Return the noise of an empty pixel, electrons rms."""
         return float(np.sqrt(np.mean(background) + self.detector.read_noise**2))
+
+    def pixel_noise(self, exposure: Exposure) -> float:
+        """Return the noise of an empty pixel, electrons rms."""
+        return self.sky_noise(exposure, self.background(exposure, self.header(exposure)))
+
+    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray) -> PsfModel:
+        """Raise NotImplementedError: Roman's tiles are drizzled from exposures, never drawn from a cadence."""
+        raise NotImplementedError("Roman's tiles are drizzled from exposures")
 
 
 def _date(mjd: float):

@@ -7,19 +7,22 @@ trapped again), so that an exposure needs those tables alone and none is drawn t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
-from romandask.instruments.instrument import Exposure
-from romandask.instruments.roman.calibration import MakeCalibration
-from romandask.instruments.roman.roman import Roman
+from romandask.instruments.exposure import Exposure
+from romandask.instruments.instrument import Instrument, Light
+from romandask.instruments.roman.calibration import unit_name
 from romandask.kernels.detectors.cosmic_rays import hits, tracks
 from romandask.kernels.detectors.sca import MEMORY, band_mean
 from romandask.kernels.detectors.sca_exposure import (
+    FLAGS,
     Planes,
     Response,
     Trapped,
@@ -29,10 +32,12 @@ from romandask.kernels.detectors.sca_exposure import (
     read_out,
     trap,
 )
+from romandask.kernels.detectors.simple_detector import DQ_FLAGS
 from romandask.kernels.detectors.synthetic_sca import SCA_SHAPE, WAVES
 from romandask.model.seeds import rng
 from romandask.products.images import ImageProduct
-from romandask.storage.arrays import ROWS_A_FILE
+from romandask.products.schemas import schema
+from romandask.storage.arrays import ROWS_A_FILE, Variable
 
 DAY = 86400.0
 """Seconds."""
@@ -72,14 +77,58 @@ def trapped_table(charge: np.ndarray, planes: Planes) -> pd.DataFrame:
 class ScaReadout:
     """Reads out exposures with every effect of their SCA."""
 
-    instrument: Roman
+    instrument: Instrument
     calibration: ImageProduct
     """What `calibrations()` returned."""
     seed: int
+    cosmic_rays: bool
+    seconds_per_pixel: float = 7e-7
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """The calibrated image, its data quality and variance, and the raw data numbers."""
+        shape, axes, bits = self.instrument.shape, ("y", "x"), {**DQ_FLAGS, **FLAGS}
+        masks = {"long_name": "data quality", "flag_masks": list(bits.values()), "flag_meanings": " ".join(bits)}
+        electrons = {"units": "electron", "long_name": "calibrated image, sky included"}
+        return (
+            Variable("image", "float32", shape, axes, electrons),
+            Variable("dq", "uint16", shape, axes, masks),
+            Variable("raw", "uint16", shape, axes, {"units": "DN", "long_name": "what was read"}),
+            Variable("variance", "float32", shape, axes, {"units": "electron2", "long_name": "variance of the image"}),
+        )
+
+    @property
+    def tables(self) -> dict[str, pa.Schema]:
+        """Charge that stays in traps."""
+        return {"trapped": schema("trapped")}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Whether there are cosmic rays."""
+        return {"cosmic_rays": self.cosmic_rays}
+
+    def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
+        """Return the rows of the exposures of the same SCA whose afterglow an exposure has, in order of time."""
+        return before(table, row)
+
+    def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
+        """Return the calibration of the exposure's SCA."""
+        return ((self.calibration.stage, self.calibration.names[self.unit(exposure)]),)
+
+    def leave(self, light: Light) -> pd.DataFrame:
+        """Return the charge that an exposure leaves in traps: it depends on its own light alone."""
+        planes = self.planes(light.exposure)
+        electrons, response = light.expected() + light.background, self.response(light.exposure, planes)
+        return trapped_table(self.charge(light.exposure, electrons, planes, response)[0], planes)
+
+    def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
+        """Return raw, image, truth, variance, dq and the table of trapped charge of an exposure."""
+        expected = light.expected()
+        return {**self.read(light.exposure, expected + light.background, left), "truth": expected}
 
     def unit(self, exposure: Exposure) -> int:
         """Return the number of an exposure's SCA in the calibrations."""
-        return self._maker.scas.index(exposure.detector)
+        return self.calibration.names.index(unit_name(exposure.detector))
 
     def charge(
         self, exposure: Exposure, light: np.ndarray, planes: Planes, response: Response
@@ -90,16 +139,16 @@ class ScaReadout:
 
     def rays(self, exposure: Exposure) -> np.ndarray | None:
         """Return the electrons (4096, 4096) of cosmic rays; None where there are to be none."""
-        if not self.instrument.settings.cosmic_rays:
+        if not self.cosmic_rays:
             return None
         return hits(
             SCA_SHAPE,
             tracks(SCA_SHAPE, exposure.exptime, self.random(exposure, "rays", 0)),
         )
 
-    def __call__(
+    def read(
         self, exposure: Exposure, light: np.ndarray, left: Sequence[tuple[Exposure, pd.DataFrame]]
-    ) -> dict[str, np.ndarray | pd.DataFrame]:
+    ) -> dict[str, Any]:
         """Return raw, image, variance, dq and the table of trapped charge of an exposure.
 
         Parameters
@@ -122,7 +171,7 @@ class ScaReadout:
         product, index = self.calibration, self.unit(exposure)
         axes = {variable.name: variable.axes for variable in product.variables}
         if not product.has(index):
-            whole = _made(self._maker, index)
+            whole = _made(product.make, index)
 
             def of_whole(name: str, rows: slice) -> np.ndarray:
                 return whole[name][..., rows, :] if axes[name][-1] == "x" else whole[name]
@@ -159,12 +208,6 @@ class ScaReadout:
         )
         return Response(efficiency, electrons, exposure.exptime)
 
-    @property
-    def _maker(self) -> MakeCalibration:
-        maker = self.calibration.make
-        assert isinstance(maker, MakeCalibration)
-        return maker
-
     def random(self, exposure: Exposure, step: str, block: int) -> np.random.Generator:
         """Return the random generator of a step and block of rows of an exposure."""
         name = self.instrument.name
@@ -172,6 +215,6 @@ class ScaReadout:
 
 
 @lru_cache(maxsize=1)
-def _made(maker: MakeCalibration, index: int) -> dict[str, np.ndarray]:
+def _made(make: Callable[[int], dict[str, Any]], index: int) -> dict[str, np.ndarray]:
     """Return the calibrations of an SCA that are not stored: long in the making, so kept until the next SCA's."""
-    return maker(index)
+    return make(index)

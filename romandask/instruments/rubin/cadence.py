@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.rubin.depth import EFFECTIVE_WAVE, EXTINCTION
+from romandask.instruments.rubin.bands import BANDS
 from romandask.model.seeds import rng
 from romandask.model.sky import Region, unit_vectors
 
@@ -39,29 +39,12 @@ SEEING_NIGHT, SEEING_BLOCK = 0.22, 0.18
 """Scatter of ln(seeing) between and within nights: 0.28 in all, the quartiles of PSTN-054's table 3."""
 SKY_SCATTER = 0.05
 """mag"""
-DARK = {"u": 22.68, "g": 22.25, "r": 21.2, "i": 20.46, "z": 19.43, "y": 18.6}
-"""Dark zenith sky, AB mag / arcsec2 (SMTN-002; u and z from PSTN-054, table 3: OpSim's sky model is brighter there)."""
-SUN = {"u": -25.30, "g": -26.52, "r": -26.93, "i": -27.05, "z": -27.07, "y": -27.07}
 SUN_V = -26.76
-"""AB magnitudes of the Sun in LSST's bands (Willmer 2018)."""
+"""AB magnitude of the Sun in V (Willmer 2018)."""
 EXTINCTION_V = 0.172
 """mag an airmass, of Krisciunas & Schaefer (1991)."""
-SUN_LIMIT = {"u": -18.0, "g": -18.0, "r": -18.0, "i": -15.0, "z": -12.0, "y": -12.0}
-"""Altitude of the Sun, degrees, above which a band is not used."""
 MOONLIGHT = (0.0, 0.1, 0.3, 0.8)
-CHOICE = {
-    "u": (1.0, 0.2, 0.0, 0.0),
-    "g": (1.0, 0.4, 0.05, 0.0),
-    "r": (1.0, 0.8, 0.4, 0.1),
-    "i": (0.8, 1.0, 1.0, 1.0),
-    "z": (0.2, 0.8, 1.5, 3.0),
-    "y": (0.15, 0.6, 1.5, 4.0),
-}
-"""How often, over its share of the visits, a band is chosen at these values of `moonlight`.
-
-Set so that medians of the sky brightness are near those of OpSim's baseline 2.0 (PSTN-054, table 3: 22.59, 21.98,
-20.94, 20.01, 18.80, 18.20): u and g in the dark, z and y in moonlight and twilight.
-"""
+"""Values of `moonlight` at which `RubinBand.moonlight_choice` is given."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +129,10 @@ def filter_blocks(seed: int, start: float, means: Mapping[str, int], seeing: flo
     light = moonlight(times + BLOCK / 2)
     names = list(means)
     # wanted share of the blocks; a band that may not be used leaves them to the others
-    chances = [means[name] * np.interp(light, MOONLIGHT, CHOICE[name]) for name in names]
-    weight = np.stack([np.where(sun < SUN_LIMIT[name], chance, 0) for name, chance in zip(names, chances, strict=True)])
+    chances = [means[name] * np.interp(light, MOONLIGHT, BANDS[name].moonlight_choice) for name in names]
+    weight = np.stack(
+        [np.where(sun < BANDS[name].sun_limit, chance, 0) for name, chance in zip(names, chances, strict=True)]
+    )
     total = weight.sum(axis=0)
     band = np.array([*names, ""], object)[(np.cumsum(weight, axis=0) <= choice * total).sum(axis=0)]
     used = (total > 0) & clear[:, None] & (times >= start) & (times < start + NIGHTS)
@@ -325,22 +310,23 @@ def moonlight(mjd) -> np.ndarray:
 def sky_brightness(band: str, ra, dec, mjd) -> np.ndarray:
     """Return the sky at positions and times, AB mag / arcsec2: airglow, scattered moonlight and twilight.
 
-    Airglow (`DARK` at zenith) and moonlight follow Krisciunas & Schaefer (1991). Their V is carried to a band with the
-    Sun's colour and wavelength^-2, between Rayleigh's and Mie's scattering; twilight is V 22.3 at -15 degrees, one
-    magnitude a degree (Patat et al. 2006), with the Sun's colour. Both are fitted to visits of an OpSim baseline 3.
+    Airglow (`RubinBand.airglow` at zenith) and moonlight follow Krisciunas & Schaefer (1991). Their V is carried to a
+    band with the Sun's colour and wavelength^-2, between Rayleigh's and Mie's scattering; twilight is V 22.3 at -15
+    degrees, one magnitude a degree (Patat et al. 2006), with the Sun's colour. Both are fitted to visits of an OpSim
+    baseline 3.
     """
     zenith = 90 - altitude(ra, dec, mjd)
     path = 1 / np.sqrt(1 - 0.96 * np.sin(np.radians(zenith)) ** 2)
-    dark = 10 ** (-0.4 * (DARK[band] + EXTINCTION[band] * (path - 1))) * path
-    colour = SUN[band] - SUN_V
+    dark = 10 ** (-0.4 * (BANDS[band].airglow + BANDS[band].extinction * (path - 1))) * path
+    colour = BANDS[band].sun - SUN_V
     moon_ra, moon_dec = moon_position(mjd)
     moon_high = altitude(moon_ra, moon_dec, mjd)
     moon_path = 1 / np.sqrt(1 - 0.96 * np.cos(np.radians(np.maximum(moon_high, 0))) ** 2)
     phase = moon_phase(mjd)
     apart = np.degrees(np.arccos(np.sum(unit_vectors(moon_ra, moon_dec) * unit_vectors(ra, dec), axis=-1)))
     scattered = 10**5.36 * (1.06 + np.cos(np.radians(apart)) ** 2) + 10 ** (6.15 - apart / 40)
-    scattered *= (EFFECTIVE_WAVE[band] / 550) ** -2 * (1 - 10 ** (-0.4 * EXTINCTION_V * path))
-    moon = 3.84 + 0.026 * phase + 4e-9 * phase**4 + EXTINCTION[band] * moon_path
+    scattered *= (BANDS[band].effective_wave / 550) ** -2 * (1 - 10 ** (-0.4 * EXTINCTION_V * path))
+    moon = 3.84 + 0.026 * phase + 4e-9 * phase**4 + BANDS[band].extinction * moon_path
     # nanolamberts; 34.08 are V 22.5 mag / arcsec2
     lit = np.where(moon_high > 0, scattered * 10 ** (-0.4 * moon), 0) / 34.08 * 10 ** (-0.4 * (22.5 + colour))
     twilight = 10 ** (-0.4 * (22.3 - (altitude(*sun_position(mjd), mjd) + 15) + colour))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 
-from romandask.instruments.instrument import Exposure
-from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.exposure import Exposure
+from romandask.instruments.instrument import Instrument, Light
 from romandask.kernels.detectors.ccd import (
     CCD_FLAGS,
     COSMIC_RAY,
@@ -23,6 +27,7 @@ from romandask.kernels.detectors.ccd import (
 from romandask.kernels.detectors.cosmic_rays import hits, tracks
 from romandask.kernels.detectors.poisson import poisson
 from romandask.kernels.detectors.simple_detector import SATURATED
+from romandask.kernels.rendering.silicon import LEAST, through_silicon
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
@@ -31,8 +36,58 @@ from romandask.storage.arrays import Variable
 class CcdReadout:
     """Reads out exposures of Rubin's CCDs."""
 
-    instrument: Rubin
+    instrument: Instrument
     seed: int
+    cosmic_rays: bool
+    sensor: str
+    """`ideal`; or `silicon`: bright objects go photon by photon through GalSim's model of the CCD."""
+    seconds_per_pixel: float = 7e-7
+
+    @property
+    def tables(self) -> dict[str, pa.Schema]:
+        """No tables."""
+        return {}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The model of the sensor, and whether there are cosmic rays."""
+        return {"sensor": self.sensor, "cosmic_rays": self.cosmic_rays}
+
+    def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
+        """Return no rows: the detector keeps nothing from one exposure to the next."""
+        return np.empty(0, int)
+
+    def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
+        """Return no units: amplifiers are made up from the seed."""
+        return ()
+
+    def leave(self, light: Light) -> pd.DataFrame:
+        """Raise NotImplementedError: nothing is left."""
+        raise NotImplementedError("a CCD leaves nothing to later exposures")
+
+    def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
+        """Return raw, image, truth, variance and dq of an exposure, bright objects through the silicon if asked for."""
+        exposure, scene, sizes = light.exposure, light.scene, light.stamp_sizes
+        bright = (scene.fluxes() >= LEAST) & (sizes > 0)
+        if self.sensor == "ideal" or not bright.any():
+            expected = light.expected()
+            return {**self.read(exposure, expected, light.background, None), "truth": expected}
+        faint, shining = light.expected(~bright), light.expected(bright)
+
+        def seed(n: int) -> int:
+            return int(self.random(exposure, "photons", int(scene.key[n])).integers(1, 1 << 31))
+
+        caught = through_silicon(
+            scene,
+            np.flatnonzero(bright),
+            sizes,
+            light.profiles,
+            self.instrument.bandpass(exposure.band).nodes,
+            self.instrument.shape,
+            self.instrument.pixel_scale,
+            seed,
+        )
+        return {**self.read(exposure, faint, light.background, caught), "truth": faint + shining}
 
     def amplifiers(self, detector: int) -> Amplifiers:
         """Return the amplifiers of a detector: the same in all its exposures."""
@@ -40,7 +95,7 @@ class CcdReadout:
         random = rng(self.seed, "exposures", self.instrument.name, "amplifiers", detector)
         return amplifiers(random, constants.read_noise, constants.saturation)
 
-    def __call__(
+    def read(
         self, exposure: Exposure, light: np.ndarray, background: np.ndarray, caught: np.ndarray | None
     ) -> dict[str, np.ndarray]:
         """Return raw, image, variance and dq of an exposure.
@@ -59,7 +114,7 @@ class CcdReadout:
         if caught is not None:
             charge += caught
         dq = np.zeros(charge.shape, np.uint16)
-        if self.instrument.settings.cosmic_rays:
+        if self.cosmic_rays:
             rays = hits(charge.shape, tracks(charge.shape, exposure.exptime, self.random(exposure, "rays"), **RAYS))
             charge += rays
             dq[rays > COSMIC_RAY_THRESHOLD] = COSMIC_RAY

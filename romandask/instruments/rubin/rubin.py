@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import galsim
 import numpy as np
 import pandas as pd
 from pydantic import AfterValidator, Field, model_validator
 
-from romandask.instruments.instrument import WHOLE, Exposure, pixel_areas
+from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
+from romandask.instruments.instrument import (
+    InstrumentContext,
+    InstrumentSettings,
+    Light,
+    Publication,
+    Readout,
+)
+from romandask.instruments.rubin.bands import BANDS, COLOUR_BAND, REFERENCE_BAND
 from romandask.instruments.rubin.cadence import cadence
+from romandask.instruments.rubin.ccd_readout import CcdReadout
 from romandask.instruments.rubin.depth import SYSTEM_FWHM
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel, place_grid
@@ -28,7 +37,7 @@ from romandask.kernels.rendering.seeing import (
 )
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.model.seeds import rng
-from romandask.model.settings import Section, distinct
+from romandask.model.settings import Section, distinct, one_of
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
@@ -52,7 +61,15 @@ SIGMA = 2.3548200450309493
 FREQUENCY = np.linspace(0, 2.2 * np.pi * np.sqrt(2) / SCALE, 3000)
 """Radial frequencies at which transforms of PSFs are known, 1/arcsec."""
 
-Band = Literal["u", "g", "r", "i", "z", "y"]
+Band = Annotated[str, AfterValidator(one_of(BANDS))]
+
+
+PUBLICATION = Publication(
+    source="Troxel et al. 2023",
+    # of its 1039 tiles' unique areas
+    galaxies=6_831_656 / (1039 * 0.125**2),
+    stars=159_575 / (1039 * 0.125**2),
+)
 
 
 class RubinPointings(Section):
@@ -62,15 +79,17 @@ class RubinPointings(Section):
     path: str | None = Field(None, description="OpSim SQLite file, below `data`")
     start: float = Field(60980.0, description="first night of the cadence, MJD")
     visits: dict[Band, Annotated[int, Field(ge=0, le=10_000)]] = Field(
-        {"u": 28, "g": 40, "r": 92, "i": 92, "z": 80, "y": 80}, description="mean visits of a point, by band"
+        {name: band.visits for name, band in BANDS.items()}, description="mean visits of a point, by band"
     )
     seeing: float = Field(0.6, gt=0, description="median atmospheric FWHM at 500 nm and zenith, arcsec")
 
 
-class RubinSettings(Section):
+class RubinSettings(InstrumentSettings):
     """The Rubin block of a pipeline."""
 
-    bands: Annotated[tuple[Band, ...], AfterValidator(distinct)] = Field(("u", "g", "r", "i", "z", "y"), min_length=1)
+    every_band: ClassVar[tuple[str, ...]] = tuple(BANDS)
+    usual_reference_band: ClassVar[str] = REFERENCE_BAND
+    bands: Annotated[tuple[Band, ...], AfterValidator(distinct)] = Field(tuple(BANDS), min_length=1)
     mode: Literal["coadd", "visits"] = Field(
         "coadd", description="coadd: tiles are drawn directly; visits: each visit and detector, then warped and coadded"
     )
@@ -89,6 +108,10 @@ class RubinSettings(Section):
             raise ValueError(f"pointings.visits has no entry for {', '.join(missing)}")
         return self
 
+    def instrument(self, context: InstrumentContext) -> Rubin:
+        """Return Rubin with these settings."""
+        return Rubin(self, context.n_waves, seed=context.seed)
+
 
 @dataclass(frozen=True)
 class Rubin:
@@ -97,6 +120,12 @@ class Rubin:
     settings: RubinSettings
     n_waves: int = 5
     name: str = "rubin"
+    title: str = "Rubin"
+    facility: tuple[str, str] = ("Rubin Observatory", "LSSTCam")
+    code: int = 1
+    blend_role: Literal["blended"] = "blended"
+    publication: Publication = PUBLICATION
+    data_model_elements: Mapping[str, str] = field(default_factory=dict, compare=False)
     coadd_scale: float = SCALE
     pixel_scale: float = SCALE
     shape: tuple[int, int] = (4000, 4072)
@@ -107,6 +136,7 @@ class Rubin:
     detection: Literal["median", "peaks"] = "peaks"
     detection_bands: tuple[str, ...] | None = None
     detector: Detector = Detector(saturation=1e5, read_noise=9.0)
+    visit_seconds: float = 30.0
     seed: int = 0
     """Of the survey: visits have their own turbulence."""
 
@@ -114,6 +144,21 @@ class Rubin:
     def bands(self) -> tuple[str, ...]:
         """Bands of this pipeline."""
         return self.settings.bands
+
+    @property
+    def reference_band(self) -> str:
+        """i, or the middle one of this pipeline's bands."""
+        return REFERENCE_BAND if REFERENCE_BAND in self.bands else self.bands[len(self.bands) // 2]
+
+    @property
+    def colour_band(self) -> str:
+        """g, or the reference band."""
+        return COLOUR_BAND if COLOUR_BAND in self.bands else self.reference_band
+
+    @property
+    def picture_bands(self) -> tuple[str, ...]:
+        """z, i, r and g of this pipeline's bands; all of them where it has none of these."""
+        return tuple(band for band in "zirg" if band in self.bands) or self.bands
 
     @property
     def psf_settings(self) -> dict[str, object]:
@@ -133,6 +178,20 @@ class Rubin:
     def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
         """Return None."""
         return None
+
+    def readout(self, seed: int, calibration: ImageProduct | None) -> Readout:
+        """Return the CCDs, which need no calibration."""
+        return CcdReadout(self, seed, self.settings.cosmic_rays, self.settings.sensor)
+
+    def effects(
+        self,
+        readout: Readout,
+        light: Light,
+        expected: np.ndarray,
+        left: Sequence[tuple[Exposure, pd.DataFrame]],
+    ) -> dict[str, np.ndarray]:
+        """Return no images: the effects of a CCD are not taken apart."""
+        return {}
 
     def bandpass(self, band: str) -> Bandpass:
         """Return a bandpass with this instrument's PSF nodes."""

@@ -21,10 +21,10 @@ from romandask.stages.analysis.friends_of_friends import (
     Matches,
     chance_of,
     has_joint_analysis,
+    joint,
     length_name,
     matches_of,
 )
-from romandask.stages.detections.truth_match import reference_band
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.stages.truth.catalogs import truth_of
 
@@ -34,29 +34,40 @@ COLOUR_EDGES = np.arange(-3.0, 8.01, 0.25)
 """Bins of g - F184."""
 SIZE_EDGES = np.arange(0.0, 2.001, 0.05)
 """Bins of half-light radius, arcsec."""
-SURVEYS = ("roman", "rubin")
 REAL = 0.05
 """Share of a blend's true light in i that its second true object has at least for the blend to be real."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class PairSample:
+    """What the statistics know of the objects of one survey."""
+
+    table: TableProduct
+    """Its sample."""
+    code: int
+    """Number of the survey in the keys of objects."""
+    reference_band: str
+    """Band in which magnitudes are compared."""
+    colour_band: str
+    """Band of the colour between the two surveys."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Samples:
     """What the statistics know of the objects in groups."""
 
-    tables: dict[str, TableProduct]
-    """Samples by survey."""
-    reference: dict[str, str]
-    """Band by survey in which magnitudes are compared."""
+    sharp: PairSample
+    """The survey whose several objects are one of the other: Roman."""
+    blended: PairSample
+    """The survey whose blends are counted: Rubin."""
     galaxies: TableProduct
     """Truth."""
     stars: TableProduct
 
     @property
-    def colour(self) -> dict[str, str]:
-        """Band by survey of the colour: g of Rubin less F184 of Roman, or what comes closest to them."""
-        columns = {name: self.tables[name].schema.names for name in SURVEYS}
-        wanted = {"roman": "F184", "rubin": "g"}
-        return {name: band if f"{band}_mag" in columns[name] else self.reference[name] for name, band in wanted.items()}
+    def both(self) -> tuple[PairSample, PairSample]:
+        """The two surveys."""
+        return self.sharp, self.blended
 
 
 @dataclass(frozen=True)
@@ -82,13 +93,13 @@ def statistics(found: Matches, shifted: Matches, samples: Samples, lengths: tupl
     """
     state = {
         "lengths": lengths,
-        "bands": [samples.reference, samples.colour],
+        "bands": [[one.code, one.reference_band, one.colour_band] for one in samples.both],
         "real": REAL,
         "edges": [MAG_EDGES.tolist(), COLOUR_EDGES.tolist(), SIZE_EDGES.tolist()],
     }
 
     def table(name: str, groups: Matches, kind: type[_Table], columns: str = "") -> TableProduct:
-        products = (groups.groups, groups.merged, *samples.tables.values(), samples.galaxies, samples.stars)
+        products = (groups.groups, groups.merged, *(one.table for one in samples.both), samples.galaxies, samples.stars)
         upstream = tuple((product.stage, unit) for product in products for unit in product.names)
         return TableProduct(
             f"statistics/{name}",
@@ -115,9 +126,9 @@ def matrix(blends: pd.DataFrame, length: float) -> pd.DataFrame:
 def whole_groups(found: Matches, samples: Samples) -> Iterator[pd.DataFrame]:
     """Yield the objects of all groups, some at a time, no group in two parts.
 
-    Columns: rubin (True, or False for Roman), a column group_<length> a linking length, magnitude in the reference
-    band and in that of the colour (`other`), half_light_radius, counterpart (a number that tells true objects apart;
-    -1 for none) and true_flux, that of the counterpart in Rubin's reference band, nJy.
+    Columns: blended (True for an object of the blended survey), a column group_<length> a linking length, magnitude in
+    the reference band and in that of the colour (`other`), half_light_radius, counterpart (a number that tells true
+    objects apart; -1 for none) and true_flux, that of the counterpart in the blended survey's reference band, nJy.
     """
     merged = found.merged.load(0)["key"].to_numpy()
     aside = []
@@ -136,14 +147,14 @@ def whole_groups(found: Matches, samples: Samples) -> Iterator[pd.DataFrame]:
 
 def _described(groups: pd.DataFrame, samples: Samples, cell: int, order: int) -> pd.DataFrame:
     """Return the rows of `whole_groups` of one partition."""
-    band = samples.reference["rubin"]
+    band = samples.blended.reference_band
     parts = []
-    for code, (name, table) in enumerate(samples.tables.items()):
-        magnitude, other = (f"{bands[name]}_mag" for bands in (samples.reference, samples.colour))
+    for one in samples.both:
+        magnitude, other = f"{one.reference_band}_mag", f"{one.colour_band}_mag"
         columns = ["objectId", magnitude, other, "half_light_radius", "truth_id", "star"]
-        rows = table.rows_in(np.array([cell]), order, columns)
+        rows = one.table.rows_in(np.array([cell]), order, columns)
         values = {"magnitude": rows[magnitude].to_numpy(float), "other": rows[other].to_numpy(float)}
-        key = rows["objectId"].to_numpy(np.int64) * CODES + code
+        key = rows["objectId"].to_numpy(np.int64) * CODES + one.code
         parts.append(rows[["half_light_radius", "truth_id", "star"]].assign(**values, key=key))
     frame = groups.merge(pd.concat(parts, ignore_index=True), on="key", validate="one_to_one")
     true = []
@@ -157,7 +168,7 @@ def _described(groups: pd.DataFrame, samples: Samples, cell: int, order: int) ->
     counterpart = np.where(frame["truth_id"] >= 0, frame["truth_id"] * 2 + frame["star"], -1)
     names = [name for name in frame.columns if name.startswith("group_")]
     kept = [*names, "magnitude", "other", "half_light_radius", "true_flux"]
-    return frame[kept].assign(counterpart=counterpart, rubin=frame["key"].to_numpy() % CODES == 1)
+    return frame[kept].assign(counterpart=counterpart, blended=frame["key"].to_numpy() % CODES == samples.blended.code)
 
 
 @dataclass(frozen=True)
@@ -165,20 +176,20 @@ class Counted:
     """Groups of one linking length: of each object (n,) its group's number and, by group (m,), numbers of objects."""
 
     group: np.ndarray
-    roman: np.ndarray
-    rubin: np.ndarray
+    sharp: np.ndarray
+    blended: np.ndarray
 
     @property
     def blend(self) -> np.ndarray:
         """(m,) True for unrecognised blends."""
-        return (self.rubin == 1) & (self.roman >= 2)
+        return (self.blended == 1) & (self.sharp >= 2)
 
 
 def counted(rows: pd.DataFrame, length: float) -> Counted:
     """Return the groups of some rows of `whole_groups`."""
     _, group = np.unique(rows[f"group_{length_name(length)}"].to_numpy(), return_inverse=True)
-    rubin, count = rows["rubin"].to_numpy(), int(group.max(initial=-1)) + 1
-    return Counted(group, np.bincount(group[~rubin], minlength=count), np.bincount(group[rubin], minlength=count))
+    blended, count = rows["blended"].to_numpy(), int(group.max(initial=-1)) + 1
+    return Counted(group, np.bincount(group[~blended], minlength=count), np.bincount(group[blended], minlength=count))
 
 
 def real(rows: pd.DataFrame, groups: Counted) -> np.ndarray:
@@ -186,21 +197,21 @@ def real(rows: pd.DataFrame, groups: Counted) -> np.ndarray:
 
     Where two objects are parts of one galaxy, or the second is nothing that Rubin could see, there is no blend.
     """
-    roman = (~rows["rubin"] & (rows["counterpart"] >= 0)).to_numpy()
+    sharp = (~rows["blended"] & (rows["counterpart"] >= 0)).to_numpy()
     members = (
         pd.DataFrame(
             {
-                "group": groups.group[roman],
-                "counterpart": rows["counterpart"].to_numpy()[roman],
-                "flux": np.nan_to_num(rows["true_flux"].to_numpy(float)[roman]),
+                "group": groups.group[sharp],
+                "counterpart": rows["counterpart"].to_numpy()[sharp],
+                "flux": np.nan_to_num(rows["true_flux"].to_numpy(float)[sharp]),
             }
         )
         .drop_duplicates(["group", "counterpart"])
         .sort_values(["group", "flux"], ascending=[True, False])
     )
-    total = np.bincount(members["group"], members["flux"], len(groups.roman))
+    total = np.bincount(members["group"], members["flux"], len(groups.sharp))
     second = members[members.groupby("group").cumcount() == 1]
-    found = np.zeros(len(groups.roman), bool)
+    found = np.zeros(len(groups.sharp), bool)
     found[second["group"]] = second["flux"].to_numpy() >= REAL * total[second["group"]]
     return found
 
@@ -225,7 +236,7 @@ class _Table(ABC):
 class _Blends(_Table):
     def __call__(self, index: int) -> pd.DataFrame:
         counts = [
-            pd.DataFrame({"linking_length": length, "n_roman": groups.roman, "n_rubin": groups.rubin})
+            pd.DataFrame({"linking_length": length, "n_roman": groups.sharp, "n_rubin": groups.blended})
             .value_counts()
             .rename("groups")
             .reset_index()
@@ -242,9 +253,9 @@ class _Unrecognised(_Table):
         names = ("rubin_objects", "with_roman", "blends", "real", "alone")
         totals = {length: np.zeros((len(names), len(MAG_EDGES) - 1), np.int64) for length in self.lengths}
         for length, rows, groups in self.parts():
-            rubin = rows["rubin"].to_numpy()
-            group, magnitude = groups.group[rubin], rows["magnitude"].to_numpy()[rubin]
-            blend, seen = groups.blend, groups.roman >= 1
+            blended = rows["blended"].to_numpy()
+            group, magnitude = groups.group[blended], rows["magnitude"].to_numpy()[blended]
+            blend, seen = groups.blend, groups.sharp >= 1
             for number, chosen in enumerate((seen | True, seen, blend, blend & real(rows, groups), ~seen)):
                 totals[length][number] += np.histogram(magnitude[chosen[group]], MAG_EDGES)[0]
         parts = []
@@ -276,18 +287,20 @@ class _Distributions(_Table):
             (length, name): np.zeros((2, len(edges[name]) - 1), np.int64) for length in self.lengths for name in edges
         }
         for length, rows, groups in self.parts():
-            rubin = rows["rubin"].to_numpy()
+            blended = rows["blended"].to_numpy()
             # of Roman's objects in a group the brightest
-            bright = rows[~rubin].assign(group=groups.group[~rubin]).sort_values("magnitude").drop_duplicates("group")
-            red = np.full(len(groups.roman), np.nan)
+            bright = (
+                rows[~blended].assign(group=groups.group[~blended]).sort_values("magnitude").drop_duplicates("group")
+            )
+            red = np.full(len(groups.sharp), np.nan)
             red[bright["group"]] = bright["other"]
-            group = groups.group[rubin]
+            group = groups.group[blended]
             values = {
-                "colour": rows["other"].to_numpy()[rubin] - red[group],
-                "size": rows["half_light_radius"].to_numpy(float)[rubin],
+                "colour": rows["other"].to_numpy()[blended] - red[group],
+                "size": rows["half_light_radius"].to_numpy(float)[blended],
             }
-            one = groups.rubin[group] == 1
-            for number, chosen in enumerate((one & (groups.roman[group] == 1), groups.blend[group])):
+            one = groups.blended[group] == 1
+            for number, chosen in enumerate((one & (groups.sharp[group] == 1), groups.blend[group])):
                 for name, value in values.items():
                     totals[length, name][number] += np.histogram(value[chosen], edges[name])[0]
         return pd.concat(
@@ -311,12 +324,17 @@ class _Distributions(_Table):
 def statistics_of(context: SurveyContext) -> Statistics:
     """Return the tables of the statistics of a survey's groups."""
     truth = context.once(truth_of)
-    known = Samples(
-        {name: context.output(f"samples/{name}") for name in SURVEYS},
-        {name: reference_band(context.instruments[name]) for name in SURVEYS},
-        truth.galaxies,
-        truth.stars,
+    pair = context.once(joint)
+    sharp, blended = (
+        PairSample(
+            table=context.output(f"samples/{name}"),
+            code=context.instruments[name].code,
+            reference_band=context.instruments[name].reference_band,
+            colour_band=context.instruments[name].colour_band,
+        )
+        for name in (pair.sharp, pair.blended)
     )
+    known = Samples(sharp=sharp, blended=blended, galaxies=truth.galaxies, stars=truth.stars)
     lengths = context.pipeline.matches.linking_lengths
     found = statistics(context.once(matches_of), context.once(chance_of), known, lengths)
     store = context.store

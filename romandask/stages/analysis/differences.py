@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from astropy.wcs import WCS
 
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map
 from romandask.kernels.detectors.simple_detector import SATURATED
@@ -16,9 +15,9 @@ from romandask.model.settings import DifferenceSettings
 from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.units import Unit
-from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
-from romandask.stages.detections.tile_bands import TileBands
-from romandask.stages.exposures import RenderExposure
+from romandask.stages.coadds.tile_maker import Coadds
+from romandask.stages.detections.detections import Detections
+from romandask.stages.detections.field import Field, tile_field
 from romandask.stages.stage import Stage, SurveyContext
 from romandask.storage.arrays import Variable
 
@@ -29,7 +28,7 @@ MOST = 600
 
 
 def differences(
-    templates: ImageProduct, coadds: ImageProduct, detections: ImageProduct, settings: DifferenceSettings
+    templates: Coadds, coadds: Coadds, detections: Detections, settings: DifferenceSettings
 ) -> ImageProduct:
     """Return the lazy differences of a survey's tiles and those of a sharper one, a unit a tile, dims (tile, y, x).
 
@@ -38,36 +37,39 @@ def differences(
 
     Parameters
     ----------
-    templates, coadds : what `coadds()` returned for the sharper survey, and for this one, of the same tiles
-    detections : of this survey
+    templates, coadds : Coadds
+        Of the sharper survey and of this one, of the same tiles.
+    detections : Detections
+        Of this survey.
+    settings : DifferenceSettings
     """
-    maker = DifferTile(templates, coadds, detections, settings)
-    sharp, blunt = maker.sharp, maker.blunt
-    name, pixels = blunt.source.instrument.name, blunt.maker.pixels
+    name, pixels, scale = coadds.instrument.name, coadds.pixels, coadds.instrument.coadd_scale
 
     def unit(k: int) -> Unit:
-        tile = blunt.maker.tiles[k].name
+        tile = coadds.tiles[k].name
         images = (templates.stage, f"{tile}-{settings.template}"), (coadds.stage, f"{tile}-{settings.science}")
         return Unit(tile, settings.model_dump(), (*images, (detections.stage, tile)))
 
-    shape, axes = (pixels, pixels), ("y", "x")
     text = {
         "difference": f"{settings.science} less the matched {settings.template}",
         "template": f"{settings.template}, matched to {settings.science}",
         "rms": "of the difference; 0 for no data",
     }
-    ratio = (blunt.source.instrument.coadd_scale / sharp.source.instrument.coadd_scale) ** 2
+    ratio = (scale / templates.instrument.coadd_scale) ** 2
     return ImageProduct(
-        f"differences/{name}",
-        tuple(unit(k) for k in range(len(blunt.maker.tiles))),
-        maker,
-        tuple(
-            Variable(key, "float32", shape, axes, {"units": "nJy", "long_name": value}) for key, value in text.items()
+        stage=f"differences/{name}",
+        units=tuple(unit(k) for k in range(len(coadds.tiles))),
+        make=DifferTile(templates, coadds, detections, settings),
+        variables=tuple(
+            Variable(key, "float32", (pixels, pixels), ("y", "x"), {"units": "nJy", "long_name": value})
+            for key, value in text.items()
         ),
-        ("tile",),
-        (len(blunt.maker.tiles),),
-        lambda: {key: value for key, value in coadds.coordinates().items() if value[0] == ("tile",)},
-        {"survey": name, "pixel_scale": blunt.source.instrument.coadd_scale},
+        axes=("tile",),
+        lengths=(len(coadds.tiles),),
+        coordinates=lambda: {
+            key: value for key, value in coadds.product.coordinates().items() if value[0] == ("tile",)
+        },
+        attributes={"survey": name, "pixel_scale": scale},
         # planes of the tile, those of the basis among them; a strip of the sharper one and its transforms
         bytes_per_unit=int(pixels**2 * 75 + pixels * ratio * (ROWS + 200) * 30 + (280 << 20)),
         seconds_per_unit=pixels**2 * ratio * 4e-7,
@@ -76,61 +78,24 @@ def differences(
 
 
 @dataclass(frozen=True)
-class Side:
-    """The tiles of one survey."""
-
-    product: ImageProduct
-    band: str
-
-    @property
-    def maker(self) -> TileMaker:
-        """What makes them."""
-        return tile_maker(self.product)
-
-    @property
-    def source(self) -> RenderExposure:
-        """What makes their exposures."""
-        return self.maker.source
-
-    def bands(self, tile: int) -> TileBands:
-        """Return the bands of a tile."""
-        return TileBands(self.product, self.source.instrument, tile)
-
-    def wcs(self, tile: int) -> WCS:
-        """Return the WCS of a tile."""
-        return self.maker.wcs(tile)
-
-
-@dataclass(frozen=True)
 class DifferTile:
     """Makes the difference of one tile."""
 
-    templates: ImageProduct
-    coadds: ImageProduct
-    detections: ImageProduct
+    templates: Coadds
+    coadds: Coadds
+    detections: Detections
     settings: DifferenceSettings
-
-    @property
-    def sharp(self) -> Side:
-        """The survey of the template."""
-        return Side(self.templates, self.settings.template)
-
-    @property
-    def blunt(self) -> Side:
-        """The survey it is taken from."""
-        return Side(self.coadds, self.settings.science)
 
     def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
         """Return difference, template and rms of a tile, and the table of residuals."""
-        layer = self.blunt.bands(index).layer(self.settings.science)
+        science = tile_field(self.coadds, index).measurement(self.settings.science)
         template, bad = self.template(index, "image")
-        error = np.where(layer.mask | bad, np.float32(0), layer.error)
-        objects = self.detections.load(index, ("objects",))["objects"]
-        bright = self.bright(objects)
+        error = np.where(science.mask | bad, np.float32(0), science.error)
+        bright = self.bright(self.detections.objects(index))
         x, y = (bright[name].to_numpy(float) for name in ("x", "y"))
-        found = match(layer.image, template, error, x[:MOST], y[:MOST])
+        found = match(science.image, template, error, x[:MOST], y[:MOST])
         matched = found.image(template)
-        difference = np.where(error > 0, layer.image - matched - found.sky(), 0)
+        difference = np.where(error > 0, science.image - matched - found.sky(), 0)
         left = dipoles(difference, matched, error, x, y)
         rms = self.rms(index, found, error)
         return {
@@ -156,21 +121,21 @@ class DifferTile:
 
     def template(self, index: int, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return an array of the sharper tile as this survey's PSF has it, and where it has no data (ny, nx)."""
-        sharp, blunt = self.sharp.bands(index), self.blunt.bands(index)
-        fine, coarse = sharp.instrument.coadd_scale, blunt.instrument.coadd_scale
+        sharp, blunt = tile_field(self.templates, index), tile_field(self.coadds, index)
+        fine, coarse = sharp.pixel_scale, blunt.pixel_scale
         psfs = (
             side.arrays(band, ("psf",))["psf"]
             for side, band in ((sharp, self.settings.template), (blunt, self.settings.science))
         )
         sharp_psf, blunt_psf = psfs
-        side, pixels = self.sharp.maker.pixels, self.blunt.maker.pixels
+        side, pixels = self.templates.pixels, self.coadds.pixels
         if not (sharp_psf.any() and blunt_psf.any()):
             return np.zeros((pixels, pixels), np.float32), np.ones((pixels, pixels), bool)
         kernel = matching_kernel(sharp_psf, fine, blunt_psf, coarse)
         out, bad = np.empty((pixels, pixels), np.float32), np.empty((pixels, pixels), bool)
         for first in range(0, pixels, ROWS):
             rows = slice(first, min(first + ROWS, pixels))
-            onto = pixel_map(self.blunt.wcs(index), self.sharp.wcs(index), rows, slice(0, pixels))
+            onto = pixel_map(self.coadds.wcs(index), self.templates.wcs(index), rows, slice(0, pixels))
 
             def read(*window: slice) -> np.ndarray:
                 return sharp.arrays(self.settings.template, (name,), window)[name]
@@ -179,10 +144,10 @@ class DifferTile:
             bad[rows] = self._bad(sharp, onto, kernel.shape[0] // 4)
         return out, bad
 
-    def _bad(self, sharp: TileBands, onto: PixelMap, reach: int) -> np.ndarray:
+    def _bad(self, sharp: Field, onto: PixelMap, reach: int) -> np.ndarray:
         """True where the template has pixels without data, or saturated, near the middle of its kernel."""
         places = np.rint(onto.dense()).astype(int)
-        side = self.sharp.maker.pixels
+        side = self.templates.pixels
         low = [max(int(places[..., k].min()) - reach, 0) for k in (1, 0)]
         high = [min(int(places[..., k].max()) + reach + 1, side) for k in (1, 0)]
         window = slice(low[0], high[0]), slice(low[1], high[1])
@@ -228,7 +193,7 @@ def build_differences(context: SurveyContext, survey: str) -> ImageProduct:
     """
     settings, template = context.pipeline.differences, _template_survey(context)
     if template is None or not has_differences(context, survey):
-        raise UserError(f"difference images need {settings.template} of Roman and {settings.science} of Rubin")
+        raise UserError(f"difference images need the bands {settings.template} and {settings.science}")
     coadds = context.output(f"coadds/{template}"), context.output(f"coadds/{survey}")
     return differences(*coadds, context.output(f"detections/{survey}"), settings)
 

@@ -7,8 +7,9 @@ piece, whatever the partitions; shorter linking lengths than the longest are the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,20 +48,29 @@ class Matches:
 
 def matches(
     objects: dict[str, TableProduct],
+    codes: dict[str, int],
     settings: MatchSettings,
     region: Region,
     store: Store | None = None,
     kind: str = "matches",
-    shift: float = 0.0,
+    shift: Mapping[str, float] = MappingProxyType({}),
 ) -> Matches:
     """Return the lazy groups of the object tables of several surveys.
 
     Parameters
     ----------
-    objects : tables by survey name, with objectId, coord_ra, coord_dec; the order gives each survey its code in `key`
-    store : where the stages before the last are read, where they are stored
-    kind : first part of the names of the stages
-    shift : by so much, arcsec, the second survey is moved: of real groups nothing is left, only what chance makes
+    objects : dict of str to TableProduct
+        Tables by survey name, with objectId, coord_ra, coord_dec.
+    codes : dict of str to int
+        Number of each survey, below `CODES`: the part of a key that tells surveys apart.
+    settings : MatchSettings
+    region : Region
+    store : Store or None
+        Where the stages before the last are read, where they are stored.
+    kind : str
+        First part of the names of the products.
+    shift : mapping of str to float
+        Arcsec by which the objects of a survey are moved: what is linked then is linked by chance.
 
     Raises
     ------
@@ -73,9 +83,22 @@ def matches(
     cells = tuple(map(int, region.cells(settings.order)))
     lengths = settings.linking_lengths
     columns = tuple(map(length_name, lengths))
-    state = {"longest": max(lengths), "order": settings.order, "surveys": list(objects), "shift": shift}
+    state = {
+        "longest": max(lengths),
+        "order": settings.order,
+        "surveys": {name: codes[name] for name in objects},
+        "shift": dict(shift),
+    }
     names = [f"{settings.order}-{cell}" for cell in cells]
-    size, parts = 300 << 20, _Partitions(objects, max(lengths), settings.order, cells, shift)
+    size = 300 << 20
+    parts = _Partitions(
+        objects=objects,
+        codes={name: codes[name] for name in objects},
+        longest=max(lengths),
+        order=settings.order,
+        cells=cells,
+        shift=dict(shift),
+    )
     local = TableProduct(
         f"{kind}/local",
         tuple(Unit(name, state, parts.inputs(cell)) for name, cell in zip(names, cells, strict=True)),
@@ -108,7 +131,7 @@ def matches(
         tuple(
             Unit(name, {**state, "lengths": lengths}, ((local.stage, name), (merged.stage, "all"))) for name in names
         ),
-        _Name(local, merged, tuple(objects), lengths),
+        _Name(local, merged, {codes[name]: name for name in objects}, lengths),
         schema("groups", columns),
         cells,
         settings.order,
@@ -140,15 +163,17 @@ def group_of(groups: pd.DataFrame, merged: pd.DataFrame, length: float) -> np.nd
     return key[first[np.searchsorted(key, groups["key"].to_numpy())]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Partitions:
     """The objects of several catalogs, cut anew."""
 
     objects: dict[str, TableProduct]
+    codes: dict[str, int]
     longest: float
     order: int
     cells: tuple[int, ...]
-    shift: float = 0.0
+    shift: dict[str, float]
+    """Arcsec, by survey."""
 
     def inputs(self, cell: int, around: bool = False) -> tuple[tuple[str, str], ...]:
         """Return the units that hold the objects of a cell, and around it."""
@@ -166,13 +191,13 @@ class _Partitions:
     def rows(self, cells: np.ndarray, order: int) -> pd.DataFrame:
         """Return the objects of some cells, by key, with columns key, coord_ra, coord_dec and _healpix_29."""
         parts = []
-        for code, product in enumerate(self.objects.values()):
+        for name, product in self.objects.items():
             frame = product.rows_in(cells, order, ["objectId", "coord_ra", "coord_dec"])
-            if code == 1 and self.shift:
+            if shift := self.shift.get(name, 0.0):
                 # towards the equator: nowhere over a pole
                 dec = frame["coord_dec"]
-                frame["coord_dec"] = dec - np.where(dec > 0, 1, -1) * self.shift / 3600
-            parts.append(frame.assign(key=frame["objectId"].to_numpy(np.int64) * CODES + code))
+                frame["coord_dec"] = dec - np.where(dec > 0, 1, -1) * shift / 3600
+            parts.append(frame.assign(key=frame["objectId"].to_numpy(np.int64) * CODES + self.codes[name]))
         return pd.concat(parts, ignore_index=True).sort_values("key", ignore_index=True).drop(columns="objectId")
 
     def own(self, index: int) -> pd.DataFrame:
@@ -248,7 +273,8 @@ class _Merge:
 class _Name:
     local: TableProduct
     merged: TableProduct
-    surveys: tuple[str, ...]
+    surveys: dict[int, str]
+    """By code."""
     lengths: tuple[float, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
@@ -259,31 +285,78 @@ class _Name:
             known = merged["key"].to_numpy()[place] == key
             for name in ("into", "joined"):
                 frame[name] = np.where(known, merged[name].to_numpy()[place], frame[name].to_numpy())
-        frame["survey"] = np.array(self.surveys, object)[key % CODES]
+        names = np.array([self.surveys.get(code, "") for code in range(CODES)], object)
+        frame["survey"] = names[key % CODES]
         frame["objectId"] = key // CODES
         for length in self.lengths:
             frame[f"group_{length_name(length)}"] = group_of(frame, merged, length)
         return frame
 
 
+@dataclass(frozen=True)
+class BlendPair:
+    """The two surveys between which unrecognised blends are counted."""
+
+    sharp: str
+    """Survey whose several objects are one of the other."""
+    blended: str
+
+
+def blend_pair(context: SurveyContext) -> BlendPair | None:
+    """Return the two surveys whose blends are counted; None where a survey has only one of them.
+
+    They are those of `matches.surveys`; else the instruments that declare the parts `sharp` and `blended`.
+
+    Raises
+    ------
+    UserError
+        If `matches.surveys` names no two instruments of the pipeline.
+    """
+    wanted, instruments = context.pipeline.matches.surveys, context.instruments
+    if wanted is not None:
+        if set(wanted) - set(instruments) or wanted[0] == wanted[1]:
+            raise UserError(
+                f"matches.surveys: {', '.join(wanted)}: two different ones of {', '.join(instruments)} are needed"
+            )
+        return BlendPair(*wanted)
+    by_role = {one.blend_role: name for name, one in instruments.items() if one.blend_role is not None}
+    return BlendPair(by_role["sharp"], by_role["blended"]) if {"sharp", "blended"} <= set(by_role) else None
+
+
+def joint(context: SurveyContext) -> BlendPair:
+    """Return the two surveys whose blends are counted.
+
+    Raises
+    ------
+    UserError
+        If the survey does not have both.
+    """
+    pair = context.once(blend_pair)
+    if pair is None:
+        raise UserError(f"blends need a sharp and a blended survey; this one has {', '.join(context.instruments)}")
+    return pair
+
+
 def has_joint_analysis(context: SurveyContext, survey: str) -> bool:
     """Return whether a survey has both instruments whose blends are counted."""
-    return {"roman", "rubin"} <= set(context.instruments)
+    return context.once(blend_pair) is not None
 
 
 def matches_of(context: SurveyContext) -> Matches:
     """Return the stages of friends of friends over the samples."""
-    return _joined(context, "matches", 0.0)
+    return _joined(context, "matches", {})
 
 
 def chance_of(context: SurveyContext) -> Matches:
-    """Return the same of a sky in which one survey is moved: its groups are by chance."""
-    return _joined(context, "chance", SHIFT)
+    """Return the same of a sky in which the blended survey is moved: its groups are by chance."""
+    return _joined(context, "chance", {context.once(joint).blended: SHIFT})
 
 
-def _joined(context: SurveyContext, kind: str, shift: float) -> Matches:
-    tables = {name: context.output(f"samples/{name}") for name in context.instruments}
-    return matches(tables, context.pipeline.matches, context.region, context.store, kind, shift)
+def _joined(context: SurveyContext, kind: str, shift: dict[str, float]) -> Matches:
+    pair = context.once(joint)
+    tables = {name: context.output(f"samples/{name}") for name in (pair.sharp, pair.blended)}
+    codes = {name: context.instruments[name].code for name in tables}
+    return matches(tables, codes, context.pipeline.matches, context.region, context.store, kind, shift)
 
 
 def _stages(kind: str, products: Callable[[SurveyContext], Matches], about: str) -> tuple[Stage, ...]:

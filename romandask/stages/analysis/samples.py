@@ -12,10 +12,10 @@ from romandask.kernels.measurement.extract import FLAGS
 from romandask.model.errors import UserError
 from romandask.model.settings import MatchSettings
 from romandask.model.spectra import ab_magnitude
+from romandask.pipeline import instrument_types
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import LazyUnits, Unit
-from romandask.stages.detections.truth_match import REFERENCE_BANDS, reference_band
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 
 ALLOWED = FLAGS["deblended"] | FLAGS["kron_nonpositive"]
@@ -145,19 +145,20 @@ def build_limits(context: SurveyContext, survey: str) -> TableProduct:
         If `matches.limits` names a band that is no reference band.
     """
     settings = context.pipeline.matches
-    bands = {reference_band(instrument) for instrument in context.instruments.values()}
+    bands = {instrument.reference_band for instrument in context.instruments.values()}
     # one pipeline's limits also serve its runs with a survey, or that band, left out
-    if unknown := set(settings.limits or {}) - {*bands, *REFERENCE_BANDS}:
+    usual = {kind.usual_reference_band for kind in instrument_types().values()}
+    if unknown := set(settings.limits or {}) - bands - usual:
         raise UserError(f"matches.limits: {', '.join(sorted(unknown))}: they are those of {', '.join(sorted(bands))}")
     tables = context.output(f"objects/{survey}"), context.output(f"truth_match/{survey}")
-    return limits(*tables, settings, reference_band(context.instruments[survey]))
+    return limits(*tables, settings, context.instruments[survey].reference_band)
 
 
 def build_samples(context: SurveyContext, survey: str) -> TableProduct:
     """Return the lazy sample of an instrument's objects."""
     instrument = context.instruments[survey]
     tables = (context.output(f"{stage}/{survey}") for stage in ("objects", "truth_match", "limits"))
-    return samples(*tables, context.pipeline.matches, instrument.bands, reference_band(instrument))
+    return samples(*tables, context.pipeline.matches, instrument.bands, instrument.reference_band)
 
 
 LIMITS = Stage(

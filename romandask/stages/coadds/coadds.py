@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.instrument import EXPOSURE_COLUMNS
+from romandask.instruments.exposure import EXPOSURE_COLUMNS
 from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.model.settings import CoaddSettings
 from romandask.model.sky import touching_pairs
@@ -22,9 +22,10 @@ from romandask.products.units import LazyUnits, Unit
 from romandask.stages.coadds.drawn import DrawTile
 from romandask.stages.coadds.drizzled import DrizzleTile, most_inputs
 from romandask.stages.coadds.input_psfs import psf_side
-from romandask.stages.coadds.tile_maker import TileMaker, source_of
+from romandask.stages.coadds.tile_maker import Coadds, TileMaker
 from romandask.stages.coadds.warped import WarpTile
-from romandask.stages.exposures import cone, header_text
+from romandask.stages.exposures.exposures import Exposures, header_text
+from romandask.stages.exposures.render import cone
 from romandask.stages.pointings import corners_of
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.arrays import Variable
@@ -33,28 +34,35 @@ from romandask.storage.manifest import digest
 MAKERS: dict[str, type[TileMaker]] = {"drizzle": DrizzleTile, "draw": DrawTile, "warp": WarpTile}
 
 
-def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) -> ImageProduct:
+def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> Coadds:
     """Return the lazy coadds of a survey's exposures: dims (tile, band, y, x).
 
-    A tile reads its exposures one at a time from the exposures product: from the store where they are, rendered where
-    not. The tiles of an instrument that is drawn from its cadence use the exposures' table and truth, and render none.
+    A tile reads its exposures one at a time: from the store where they are, rendered where not. The tiles of an
+    instrument that is drawn from its cadence use the pointings and the truth, and render no exposure.
     """
-    render = source_of(exposures)
-    instrument, table = render.instrument, render.table
+    renderer = exposures.renderer
+    instrument, table = renderer.instrument, renderer.table
     grid = settings.grid()
     pixels = grid.pixels(instrument.coadd_scale)
     drawn, drizzled = instrument.coadd == "draw", instrument.coadd == "drizzle"
     footprints = np.stack([tile.corners(grid.side) for tile in tiles])
     members = _members(table, footprints, instrument.bands)
-    maker = MAKERS[instrument.coadd](exposures, tuple(tiles), members, settings, pixels, render.render)
+    maker = MAKERS[instrument.coadd](
+        exposures=exposures,
+        tiles=tuple(tiles),
+        members=members,
+        settings=settings,
+        pixels=pixels,
+        render=renderer.render,
+    )
     names = np.array(exposures.names, object)
     values = table[[name for name in EXPOSURE_COLUMNS if name != "band"]].to_numpy(float)
-    shared = {**settings.model_dump(), "instrument": instrument.name, "seed": render.seed}
+    shared = {**settings.model_dump(), "instrument": instrument.name, "seed": renderer.seed}
     shared["psf"] = instrument.psf_settings
     if drawn:
-        shared |= render.render.model_dump()
+        shared |= renderer.render.model_dump()
     elif drizzled:
-        # the arrays are as long as the busiest tile's are: another length, and all are made again
+        # the arrays are as long as the busiest tile's: with another length all are made again
         shared["inputs"] = most_inputs(members)
     keys = tuple(members)
 
@@ -63,7 +71,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         state: dict[str, Any] = {**shared, "tile": tiles[k].name, "band": band}
         if drawn:
             state["exposures"] = digest(values[chosen])
-            inputs = render.truth.inputs(*cone(footprints[k]))
+            inputs = renderer.truth.inputs(*cone(footprints[k]))
         else:
             state["exposures"] = names[chosen].tolist()
             inputs = tuple((exposures.stage, name) for name in names[chosen])
@@ -83,15 +91,15 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
 
     planes = 2 + settings.noise
     mean = np.mean([len(chosen) for chosen in members.values()])
-    return ImageProduct(
-        f"coadds/{instrument.name}",
-        LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
-        maker,
-        _planes(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
-        ("tile", "band"),
-        (len(tiles), len(instrument.bands)),
-        coordinates,
-        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+    product = ImageProduct(
+        stage=f"coadds/{instrument.name}",
+        units=LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
+        make=maker,
+        variables=_planes(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
+        axes=("tile", "band"),
+        lengths=(len(tiles), len(instrument.bands)),
+        coordinates=coordinates,
+        attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
         bytes_per_unit=max(
             pixels**2 * ((3 if drizzled else 45) + 4 * planes)
@@ -104,6 +112,7 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 2.5e-8 * float(mean)),
         tables={"sets": schema("sets")} if drizzled else {},
     )
+    return Coadds(product=product, maker=maker)
 
 
 def _members(table: pd.DataFrame, tiles: np.ndarray, bands: tuple[str, ...]) -> dict[tuple[int, str], np.ndarray]:
@@ -144,7 +153,7 @@ def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Vari
     return tuple(found)
 
 
-def build_coadds(context: SurveyContext, survey: str) -> ImageProduct:
+def build_coadds(context: SurveyContext, survey: str) -> Coadds:
     """Return the lazy coadds of an instrument."""
     return coadds(context.output(f"exposures/{survey}"), context.tiles, context.pipeline.coadds)
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from romandask.instruments.instrument import exposure_of
+from romandask.instruments.exposure import exposure_of
 from romandask.kernels.coadding.background import subtract_background
 from romandask.kernels.coadding.stack import stack
 from romandask.kernels.rendering.draw import Scene, draw, draw_wide, plan_stamps
@@ -18,9 +17,9 @@ from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
 from romandask.stages.coadds.input_psfs import psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
-from romandask.stages.exposures import cone
+from romandask.stages.exposures.exposures import flat_shares
+from romandask.stages.exposures.render import cone
 from romandask.stages.pointings import corners_of
-from romandask.stages.psf_images import flat_shares
 
 
 @dataclass(frozen=True)
@@ -29,12 +28,12 @@ class DrawTile(TileMaker):
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return image, weight, noise, nimages, dq and the PSF."""
-        source, here = self.source, self.unit(index)
-        instrument: Any = source.instrument
+        renderer, here = self.exposures.renderer, self.unit(index)
+        instrument = renderer.instrument
         tile, band, wcs = here.tile, here.band, here.wcs
         shape = (self.pixels, self.pixels)
         bandpass = instrument.bandpass(band)
-        rows = source.table.iloc[here.members]
+        rows = renderer.table.iloc[here.members]
         chosen = [exposure_of(row) for _, row in rows.iterrows()]
         to_njy = NJY_ZERO_POINT / bandpass.ab_photons()
         gains = np.array([exposure.exptime for exposure in chosen]) / to_njy
@@ -48,7 +47,7 @@ class DrawTile(TileMaker):
             side = psf_side(instrument)
             blank = np.zeros((realisations, *shape), np.float32)
             return {**made, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
-        truth = source.truth.near(*cone(tile.corners(self.settings.grid().side)))
+        truth = renderer.truth.near(*cone(tile.corners(self.settings.grid().side)))
         scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
         psf = instrument.effective_psf(chosen, layers.shares)
@@ -56,10 +55,10 @@ class DrawTile(TileMaker):
         covered = layers.weight > 0
         expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
         empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
-        light = rng(source.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        light = rng(self.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
         noise = np.empty((realisations, *shape), np.float32)
         for number, plane in enumerate(noise):
-            other = rng(source.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
+            other = rng(self.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
             other.standard_normal(out=plane, dtype=np.float32)
             plane *= np.sqrt(empty)
         image = expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0))

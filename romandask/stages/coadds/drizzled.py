@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import Exposure, Instrument, exposure_of, pixel_areas
+from romandask.instruments.exposure import Exposure, exposure_of, pixel_areas
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.coadding.background import as_float, subtract_background
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map, strips
@@ -22,7 +23,7 @@ from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.products.memory import release_free_memory
 from romandask.stages.coadds.input_psfs import input_psf, psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
-from romandask.stages.exposures import empty_variance
+from romandask.stages.exposures.exposures import empty_variance
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,10 @@ class DrizzleTile(TileMaker):
 
     def __call__(self, index: int) -> dict[str, Any]:
         """Return image, weight, noise, nimages, dq, set, PSFs and the table of sets."""
-        source, instrument, here = self.source, self.instrument, self.unit(index)
+        table, instrument, here = self.exposures.table, self.instrument, self.unit(index)
         scale, shape = instrument.coadd_scale, (self.pixels, self.pixels)
         tile, members, target = here.tile, here.members, here.wcs
-        exposures = [exposure_of(source.table.iloc[i]) for i in members]
+        exposures = [exposure_of(table.iloc[i]) for i in members]
         headers = [instrument.header(exposure) for exposure in exposures]
         frames = [WCS(header) for header in headers]
         parts = [strips(frame, instrument.shape, target, shape) for frame in frames]
@@ -51,7 +52,7 @@ class DrizzleTile(TileMaker):
                 arrays = self.exposures.load(int(i), ("image", "variance", "dq"))
                 maps = [pixel_map(frame, target, strip.rows, strip.columns) for strip in part]
                 full += [saturated_places(arrays["dq"], onto, shape) for onto in maps]
-                planes = _planes_of(arrays, maps, instrument, exposure, header, source.seed, self.settings.noise)
+                planes = _planes_of(arrays, maps, instrument, exposure, header, self.seed, self.settings.noise)
             sums.add(planes)
         arrays, planes = {}, []
         release_free_memory()

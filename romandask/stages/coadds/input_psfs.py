@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import Exposure, Instrument
+from romandask.instruments.exposure import Exposure
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import exposure_of
+from romandask.instruments.exposure import exposure_of
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.model.errors import UserError
 from romandask.model.tiles import tangent_header
-from romandask.products.images import ImageProduct
-from romandask.stages.coadds.drizzled import DrizzleTile
+from romandask.stages.coadds.tile_maker import Coadds
 
 CHOICES = np.round(np.arange(0.3, 1.001, 0.1), 1)
 UNEVEN = 0.2
@@ -40,7 +39,7 @@ class Coverage:
         return self.empty == 0 and self.uneven < UNEVEN
 
 
-def coverage(coadds: ImageProduct) -> list[Coverage]:
+def coverage(coadds: Coadds) -> list[Coverage]:
     """Return what each pixfrac of CHOICES does to each band, from the places of the exposures alone.
 
     It is measured in the middle of the tile that has the most exposures, with every pixel of them good.
@@ -50,11 +49,10 @@ def coverage(coadds: ImageProduct) -> list[Coverage]:
     UserError
         If the coadds are not drizzled, or a band has no exposure there.
     """
-    maker = coadds.make
-    if not isinstance(maker, DrizzleTile):
+    maker, table = coadds.maker, coadds.exposures.table
+    if coadds.instrument.coadd != "drizzle":
         raise UserError("pixfrac: only Roman's coadds are drizzled, and this pipeline has no Roman")
-    source = maker.source
-    instrument, scale = source.instrument, source.instrument.coadd_scale
+    instrument, scale = coadds.instrument, coadds.instrument.coadd_scale
     totals = [sum(len(maker.members[k, band]) for band in instrument.bands) for k in range(len(maker.tiles))]
     k = int(np.argmax(totals))
     target = WCS(tangent_header(maker.tiles[k].ra, maker.tiles[k].dec, TEST_SQUARE_PIXELS, scale))
@@ -62,7 +60,7 @@ def coverage(coadds: ImageProduct) -> list[Coverage]:
     for band in instrument.bands:
         seen = []
         for i in maker.members[k, band]:
-            exposure = exposure_of(source.table.iloc[i])
+            exposure = exposure_of(table.iloc[i])
             wcs = WCS(instrument.header(exposure))
             parts = strips(wcs, instrument.shape, target, (TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS))
             if parts:

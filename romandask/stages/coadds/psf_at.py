@@ -9,14 +9,13 @@ import numpy as np
 import xarray as xr
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import Exposure, Instrument, exposure_of
+from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.coadding.coadd_psf import drizzled_psf
 from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
-from romandask.products.images import ImageProduct
-from romandask.stages.coadds.drizzled import DrizzleTile
 from romandask.stages.coadds.input_psfs import jacobian, psf_side, star_on
-from romandask.stages.coadds.tile_maker import tile_maker, unit_of
+from romandask.stages.coadds.tile_maker import Coadds
 from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
@@ -35,7 +34,7 @@ class Seen:
 
 
 def coadd_psf(
-    coadds: ImageProduct,
+    coadds: Coadds,
     ra: float,
     dec: float,
     band: str,
@@ -63,17 +62,16 @@ def coadd_psf(
     UserError
         If the survey has no such band, or no exposure at the place.
     """
-    maker = coadds.make
-    if not isinstance(maker, DrizzleTile):
+    maker, instrument = coadds.maker, coadds.instrument
+    if instrument.coadd != "drizzle":
         raise UserError("PSFs at a place are those of drizzled coadds: of others each tile has one, its array psf")
-    instrument = maker.instrument
     if band not in instrument.bands:
         raise UserError(f"band {band!r}: this survey has {', '.join(instrument.bands)}")
     owner = int(maker.settings.grid().owner(ra, dec))
     tiles = [k for k, tile in enumerate(maker.tiles) if tile.id == owner]
     if not tiles:
         raise UserError(f"({ra}, {dec}): outside the tiles of this survey")
-    tile, index = maker.tiles[tiles[0]], unit_of(tiles[0], band, instrument.bands)
+    tile, index = maker.tiles[tiles[0]], coadds.index(tiles[0], band)
     header = maker.header(tiles[0])
     target = WCS(header)
     seen = _seen(coadds, index, maker.members[tiles[0], band], instrument, ra, dec, target)
@@ -103,11 +101,10 @@ def coadd_psf(
 
 
 def _seen(
-    coadds: ImageProduct, index: int, members: np.ndarray, instrument: Instrument, ra: float, dec: float, target: WCS
+    coadds: Coadds, index: int, members: np.ndarray, instrument: Instrument, ra: float, dec: float, target: WCS
 ) -> list[Seen]:
     """Return the exposures, of those that touch a tile, of which a place of it is made."""
-    maker = tile_maker(coadds)
-    table = maker.source.table
+    table = coadds.exposures.table
     if coadds.has(index):
         column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
         found = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))
@@ -120,7 +117,7 @@ def _seen(
         wcs = WCS(instrument.header(exposure))
         x, y = (float(value) for value in wcs.all_world2pix(ra, dec, 0, quiet=True))
         if -0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5:
-            seen.append(Seen(maker.exposures.names[i], exposure, wcs, x, y))
+            seen.append(Seen(coadds.exposures.names[i], exposure, wcs, x, y))
     return seen
 
 

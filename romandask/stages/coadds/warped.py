@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.wcs import WCS
 
-from romandask.instruments.instrument import Exposure, Instrument, exposure_of, pixel_areas
+from romandask.instruments.exposure import Exposure, exposure_of, pixel_areas
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.coadding.background import as_float, subtract_background
 from romandask.kernels.coadding.coadd_psf import warped_psf
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
@@ -28,13 +29,13 @@ class WarpTile(TileMaker):
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return image, weight, noise, nimages, dq and the PSF."""
-        source, instrument, here = self.source, self.instrument, self.unit(index)
+        table, instrument, here = self.exposures.table, self.instrument, self.unit(index)
         target, shape = here.wcs, (self.pixels, self.pixels)
         sums, side = Means(shape, 1 + self.settings.noise), psf_side(instrument)
         psf, used = np.zeros((side, side)), 0.0
         for i in here.members.tolist():
-            exposure = exposure_of(source.table.iloc[i])
-            weight = self._add(sums, exposure, i, target, source.seed)
+            exposure = exposure_of(table.iloc[i])
+            weight = self._add(sums, exposure, i, target, self.seed)
             if weight:
                 psf += weight * _psf(instrument, exposure, target, here.tile)
                 used += weight

@@ -1,4 +1,4 @@
-"""Detections: objects of each tile with forced photometry in every band, then object tables as HATS catalogs."""
+"""Detections: the objects of each tile with forced photometry in every band."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from astropy.wcs import WCS
 
-from romandask.kernels.detectors.simple_detector import SATURATED
+from romandask.instruments.instrument import Instrument
 from romandask.kernels.measurement.extract import (
     SATURATED_CORE,
     DetectedObjects,
@@ -24,27 +25,56 @@ from romandask.model.settings import DetectionSettings
 from romandask.model.sky import Region, unit_vectors
 from romandask.model.tiles import Tile, TileGrid
 from romandask.products.hats import with_spatial_index
+from romandask.products.image_set import ImageSet
 from romandask.products.images import ImageProduct
 from romandask.products.memory import release_free_memory
 from romandask.products.schemas import schema
 from romandask.products.units import Unit
-from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
-from romandask.stages.detections.tile_bands import TileBands
+from romandask.stages.coadds.tile_maker import Coadds
+from romandask.stages.detections.field import Field, tile_field
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
+from romandask.stages.truth.catalogs import TruthCatalogs
 from romandask.storage.arrays import Variable
 
 EXTENDED = 1.15
 """Half-light radius over the PSF's above which an object counts as extended."""
 
 
-def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region) -> ImageProduct:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Detections(ImageSet):
+    """The detections of one instrument: lazy maps of objects (tile, y, x), a table of objects beside each."""
+
+    coadds: Coadds
+    settings: DetectionSettings
+    region: Region
+
+    @property
+    def instrument(self) -> Instrument:
+        """The instrument."""
+        return self.coadds.instrument
+
+    @property
+    def truth(self) -> TruthCatalogs:
+        """The truth under the tiles."""
+        return self.coadds.truth
+
+    @property
+    def tiles(self) -> tuple[Tile, ...]:
+        """The tiles, one a unit."""
+        return self.coadds.tiles
+
+    def objects(self, index: int) -> pd.DataFrame:
+        """Return the objects of a tile (schema: catalogs/objects.yaml)."""
+        return self.load(index, ("objects",))["objects"]
+
+
+def detections(coadds: Coadds, settings: DetectionSettings, region: Region) -> Detections:
     """Return the lazy detections of a survey's coadds: one unit a tile, dims (tile, y, x).
 
-    The array `segmentation` has the number of the object in whose isophote a pixel lies, the last 24 bits of its
+    The array `segmentation` holds the number of the object in whose isophote a pixel lies, the last 24 bits of its
     objectId; 0 for none. Beside each tile's is its table `objects`, each object in the one tile that owns it.
     """
-    maker = tile_maker(coadds)
-    render, pixels, instrument, bands = maker.source, maker.pixels, maker.instrument, maker.instrument.bands
+    pixels, instrument, bands = coadds.pixels, coadds.instrument, coadds.instrument.bands
     state = {
         "settings": settings.model_dump(exclude={"order", "match_radius", "summary_magnitude"}),
         "bands": bands,
@@ -56,64 +86,64 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
 
     def inputs(k: int, tile: Tile) -> tuple[tuple[str, str], ...]:
         images = tuple((coadds.stage, f"{tile.name}-{band}") for band in bands)
-        # the Milky Way's dust is that of the truth
-        return images + render.truth.inputs(*tile_cone(maker, k))
+        # the extinction by the Milky Way is taken from the truth
+        return images + coadds.truth.inputs(*tile_cone(coadds, k))
 
-    units = tuple(Unit(tile.name, {**state, "tile": tile.name}, inputs(k, tile)) for k, tile in enumerate(maker.tiles))
+    units = tuple(Unit(tile.name, {**state, "tile": tile.name}, inputs(k, tile)) for k, tile in enumerate(coadds.tiles))
     text = {"long_name": "number of the object, the last 24 bits of its objectId; 0 for none"}
-    return ImageProduct(
-        f"detections/{instrument.name}",
-        units,
-        DetectTile(coadds, settings, region),
-        (Variable("segmentation", "int32", (pixels, pixels), ("y", "x"), text),),
-        ("tile",),
-        (len(units),),
-        lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
-        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+    product = ImageProduct(
+        stage=f"detections/{instrument.name}",
+        units=units,
+        make=DetectTile(coadds, settings, region),
+        variables=(Variable("segmentation", "int32", (pixels, pixels), ("y", "x"), text),),
+        axes=("tile",),
+        lengths=(len(units),),
+        coordinates=lambda: {
+            name: value for name, value in coadds.product.coordinates().items() if value[0] == ("tile",)
+        },
+        attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # three planes, a mask and some chunks of all bands; after that a band's two planes and the map of objects
         bytes_per_unit=pixels**2 * 13 + (420 << 20),
         seconds_per_unit=pixels**2 * 7e-7,
         tables={"objects": schema("objects", bands)},
     )
+    return Detections(product=product, coadds=coadds, settings=settings, region=region)
 
 
 @dataclass(frozen=True)
 class DetectTile:
-    """Makes the objects of one tile."""
+    """Makes the map and the objects of one tile."""
 
-    coadds: ImageProduct
+    coadds: Coadds
     settings: DetectionSettings
     region: Region
 
     def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
         """Return the map of a tile and the objects that it owns (schema: catalogs/objects.yaml)."""
-        maker, settings = tile_maker(self.coadds), self.settings
-        instrument, tile = maker.instrument, maker.tiles[index]
-        bands = TileBands(self.coadds, instrument, index)
-        combined = bands.detection()
-        if instrument.detection == "median":
-            levels = settings.deblend_levels, settings.deblend_contrast
-            found, segments = detect(combined, settings.threshold, settings.min_area, *levels, settings.min_snr)
-        else:
-            found, segments = detect_peaks(combined, settings.threshold, settings.min_area, settings.min_snr)
-        radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
-        # a band at a time is in memory
-        del combined
-        release_free_memory()
-        wcs = maker.wcs(index)
-        ra, dec = wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
-        keep = owned(ra, dec, tile, maker.settings.grid(), self.region)
-        objects = measure(select(found, keep), ra[keep], dec[keep], tile, bands, segments, radius)
+        coadds, tile = self.coadds, self.coadds.tiles[index]
+        field, wcs = tile_field(coadds, index), coadds.wcs(index)
+        found, segments, radius = find_objects(field, self.settings)
+        ra, dec = positions(found, wcs)
+        keep = owned(ra, dec, tile, coadds.settings.grid(), self.region)
+        measured = measure(select(found, keep), field, segments, radius)
+        ring, column = divmod(tile.id, 1 << 32)
+        objects = measured.assign(
+            objectId=((ring << 18) + column << 24) + found.label[keep],
+            coord_ra=ra[keep],
+            coord_dec=dec[keep],
+            tile=np.full(len(measured), tile.name, object),
+        )
+        objects = with_spatial_index(objects, "coord_ra", "coord_dec")
         at = unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy())
-        dust = maker.source.truth.milky_way(at, *tile_cone(maker, index)[:3])
-        for band in instrument.bands:
-            objects[f"{band}_extinction"] = extinction(instrument.bandpass(band), dust)
+        dust = coadds.truth.milky_way(at, *tile_cone(coadds, index)[:3])
+        for band in field.bands:
+            objects[f"{band}_extinction"] = extinction(coadds.instrument.bandpass(band), dust)
         return {"segmentation": segments, "objects": objects}
 
 
-def tile_cone(tiles: TileMaker, index: int) -> tuple[float, float, float, float]:
+def tile_cone(coadds: Coadds, index: int) -> tuple[float, float, float, float]:
     """Return centre and radii (degrees) of the cone around the unique area of a tile, for galaxies and stars."""
-    tile, grid = tiles.tiles[index], tiles.settings.grid()
+    tile, grid = coadds.tiles[index], coadds.settings.grid()
     radius = (grid.inner / np.sqrt(2) + 5) / 3600
     return tile.ra, tile.dec, radius, radius
 
@@ -123,25 +153,66 @@ def owned(ra: np.ndarray, dec: np.ndarray, tile: Tile, grid: TileGrid, region: R
     return (grid.owner(ra, dec) == tile.id) & region.contains(ra, dec)
 
 
-def measure(
-    found: DetectedObjects,
-    ra: np.ndarray,
-    dec: np.ndarray,
-    tile: Tile,
-    bands: TileBands,
-    segments: np.ndarray,
-    psf_radius: float,
-) -> pd.DataFrame:
-    """Return the object table of some detections: positions, shapes, fluxes in every band."""
-    scale = bands.instrument.coadd_scale
-    ring, column = divmod(tile.id, 1 << 32)
-    number = ((ring << 18) + column << 24) + found.label
+def detect_and_measure(field: Field, wcs: WCS, settings: DetectionSettings) -> tuple[pd.DataFrame, np.ndarray]:
+    """Detect and measure the objects of a field: of a coadd, or of images that any program made (`ArrayField`).
+
+    Parameters
+    ----------
+    field : Field
+    wcs : astropy.wcs.WCS
+        Of the images.
+    settings : DetectionSettings
+
+    Returns
+    -------
+    objects : DataFrame
+        One row an object: `label`, its number in the map, `coord_ra`, `coord_dec`, and the columns of
+        catalogs/objects.yaml but for identifiers and extinction.
+    segmentation : ndarray of int32, shape (ny, nx)
+        The map of objects; 0 for none.
+    """
+    found, segments, radius = find_objects(field, settings)
+    ra, dec = positions(found, wcs)
+    return measure(found, field, segments, radius).assign(label=found.label, coord_ra=ra, coord_dec=dec), segments
+
+
+def find_objects(field: Field, settings: DetectionSettings) -> tuple[DetectedObjects, np.ndarray, float]:
+    """Return the objects of a field's detection image, their map (ny, nx) and the half-light radius of its PSF, pixels.
+
+    Memory that the detection image took is released: photometry needs one band at a time.
+    """
+    combined = field.detection()
+    if field.method == "median":
+        levels = settings.deblend_levels, settings.deblend_contrast
+        found, segments = detect(combined, settings.threshold, settings.min_area, *levels, settings.min_snr)
+    else:
+        found, segments = detect_peaks(combined, settings.threshold, settings.min_area, settings.min_snr)
+    radius = psf_half_light_radius(combined.psf) if combined.psf.any() else 1.0
+    del combined
+    release_free_memory()
+    return found, segments, radius
+
+
+def positions(found: DetectedObjects, wcs: WCS) -> tuple[np.ndarray, np.ndarray]:
+    """Return right ascension and declination of objects, degrees."""
+    return wcs.all_pix2world(found.x, found.y, 0) if len(found.x) else (found.x, found.y)
+
+
+def measure(found: DetectedObjects, field: Field, segments: np.ndarray, psf_radius: float) -> pd.DataFrame:
+    """Return shapes and fluxes in every band of some objects (columns of catalogs/objects.yaml).
+
+    Parameters
+    ----------
+    found : DetectedObjects
+    field : Field
+    segments : ndarray, shape (ny, nx)
+        Map of all objects of the field.
+    psf_radius : float
+        Half-light radius of the PSF of the detection image, pixels.
+    """
+    scale = field.pixel_scale
     flags = found.flags.copy()
     columns = {
-        "objectId": number,
-        "coord_ra": ra,
-        "coord_dec": dec,
-        "tile": np.full(len(number), tile.name, object),
         "x": found.x,
         "y": found.y,
         "ixx": found.x2 * scale**2,
@@ -153,23 +224,21 @@ def measure(
         "blendedness": found.blendedness,
         "extendedness": (found.half_light_radius > EXTENDED * psf_radius).astype(np.int8),
     }
-    for band in bands.instrument.bands:
-        layer = bands.layer(band)
-        flux, error, flag = kron_fluxes(layer, segments, found)
+    for band in field.bands:
+        measurement = field.measurement(band)
+        flux, error, flag = kron_fluxes(measurement, segments, found)
         flags |= flag.astype(np.int32)
         columns[f"{band}_kronFlux"], columns[f"{band}_kronFluxErr"] = flux, error
         columns[f"{band}_apFlux"], columns[f"{band}_apFluxErr"] = aperture_fluxes(
-            layer, segments, found, bands.instrument.aperture / scale
+            measurement, segments, found, field.aperture / scale
         )
-        columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(layer, found)
-        del layer
-        saturated = segments[(bands.arrays(band, ("dq",))["dq"] & SATURATED) > 0]
-        flags[np.isin(found.label, saturated)] |= SATURATED_CORE
-    frame = pd.DataFrame(columns | {"flags": flags})
-    return with_spatial_index(frame, "coord_ra", "coord_dec")
+        columns[f"{band}_psfFlux"], columns[f"{band}_psfFluxErr"] = psf_fluxes(measurement, found)
+        del measurement
+        flags[np.isin(found.label, segments[field.saturated(band)])] |= SATURATED_CORE
+    return pd.DataFrame(columns | {"flags": flags})
 
 
-def build_detections(context: SurveyContext, survey: str) -> ImageProduct:
+def build_detections(context: SurveyContext, survey: str) -> Detections:
     """Return the lazy detections of an instrument."""
     return detections(context.output(f"coadds/{survey}"), context.pipeline.detections, context.region)
 

@@ -7,61 +7,47 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.instrument import Instrument
 from romandask.kernels.measurement.counterparts import counterparts
-from romandask.model.settings import DetectionSettings
 from romandask.model.sky import unit_vectors
 from romandask.model.spectra import ab_magnitude
-from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.coadds.tile_maker import TileMaker, tile_maker
-from romandask.stages.detections.detections import DetectTile, owned, tile_cone
-from romandask.stages.exposures import RenderExposure
+from romandask.stages.detections.detections import Detections, owned, tile_cone
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 BINS = np.arange(17.0, 30.01, 0.5)
 """Magnitudes between which completeness and purity are counted."""
 
-REFERENCE_BANDS = ("H158", "i")
-"""The bands in which Roman's and Rubin's magnitudes are compared, where they are surveyed."""
 
-
-def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
+def truth_match(detections: Detections) -> TableProduct:
     """Return the lazy counterparts of the objects of each tile (schema: catalogs/truth_match.yaml), a unit a tile."""
-    _, _, render = _makers(detections)
-    state = {"radius": settings.match_radius, "band": reference_band(render.instrument)}
+    instrument = detections.instrument
+    state = {"radius": detections.settings.match_radius, "band": instrument.reference_band}
     units = _units(detections, detections.stage, state)
     return TableProduct(
-        f"truth_match/{render.instrument.name}",
-        units,
-        MatchTile(detections, settings),
-        schema("truth_match"),
+        stage=f"truth_match/{instrument.name}",
+        units=units,
+        make=MatchTile(detections),
+        schema=schema("truth_match"),
         bytes_per_unit=600 << 20,
         seconds_per_unit=0.5,
     )
 
 
-def truth_summary(matched: TableProduct, detections: ImageProduct, settings: DetectionSettings) -> TableProduct:
+def truth_summary(matched: TableProduct, detections: Detections) -> TableProduct:
     """Return the lazy list of the true objects of each tile, found or not (schema: catalogs/truth_summary.yaml)."""
-    _, _, render = _makers(detections)
-    bands = render.instrument.bands
-    units = _units(detections, matched.stage, {"faintest": settings.summary_magnitude, "bands": bands})
+    instrument, bands = detections.instrument, detections.instrument.bands
+    state = {"faintest": detections.settings.summary_magnitude, "bands": bands}
+    units = _units(detections, matched.stage, state)
     return TableProduct(
-        f"truth_summary/{render.instrument.name}",
-        units,
-        SummariseTile(matched, detections, settings),
-        schema("truth_summary", bands),
+        stage=f"truth_summary/{instrument.name}",
+        units=units,
+        make=SummariseTile(matched, detections),
+        schema=schema("truth_summary", bands),
         bytes_per_unit=600 << 20,
         seconds_per_unit=0.5,
     )
-
-
-def reference_band(instrument: Instrument) -> str:
-    """Return the band in which magnitudes are compared: H158 of Roman, i of Rubin, or the middle one."""
-    bands = instrument.bands
-    return next((band for band in REFERENCE_BANDS if band in bands), bands[len(bands) // 2])
 
 
 def completeness(summary: pd.DataFrame, matched: pd.DataFrame, band: str) -> pd.DataFrame:
@@ -91,22 +77,21 @@ def completeness(summary: pd.DataFrame, matched: pd.DataFrame, band: str) -> pd.
 class MatchTile:
     """Makes the counterparts of one tile."""
 
-    detections: ImageProduct
-    settings: DetectionSettings
+    detections: Detections
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return one row for each object (schema: catalogs/truth_match.yaml)."""
-        _, tiles, render = _makers(self.detections)
-        band = reference_band(render.instrument)
-        objects = self.detections.load(index, ("objects",))["objects"]
-        true = render.truth.brief(*tile_cone(tiles, index)[:3], (band,))
+        detections = self.detections
+        band = detections.instrument.reference_band
+        objects = detections.objects(index)
+        true = detections.truth.brief(*tile_cone(detections.coadds, index)[:3], (band,))
         magnitude = ab_magnitude(objects[f"{band}_kronFlux"])
         found = counterparts(
             unit_vectors(objects["coord_ra"].to_numpy(), objects["coord_dec"].to_numpy()),
             magnitude,
             unit_vectors(true["ra"].to_numpy(), true["dec"].to_numpy()),
             ab_magnitude(true[f"flux_{band}"]),
-            np.radians(self.settings.match_radius / 3600),
+            np.radians(detections.settings.match_radius / 3600),
         )
         none = found.row < 0
         rows = true.iloc[np.where(none, 0, found.row)] if len(true) else true.reindex(range(len(objects)))
@@ -128,17 +113,16 @@ class SummariseTile:
     """Makes the list of true objects of one tile."""
 
     matched: TableProduct
-    detections: ImageProduct
-    settings: DetectionSettings
+    detections: Detections
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return one row for each true object (schema: catalogs/truth_summary.yaml)."""
-        maker, tiles, render = _makers(self.detections)
-        bands, band = render.instrument.bands, reference_band(render.instrument)
-        true = render.truth.brief(*tile_cone(tiles, index)[:3], bands)
-        tile, grid = tiles.tiles[index], tiles.settings.grid()
-        here = owned(true["ra"].to_numpy(), true["dec"].to_numpy(), tile, grid, maker.region)
-        true = true[here & (ab_magnitude(true[f"flux_{band}"]) < self.settings.summary_magnitude)]
+        detections = self.detections
+        bands, band = detections.instrument.bands, detections.instrument.reference_band
+        true = detections.truth.brief(*tile_cone(detections.coadds, index)[:3], bands)
+        tile, grid = detections.tiles[index], detections.coadds.settings.grid()
+        here = owned(true["ra"].to_numpy(), true["dec"].to_numpy(), tile, grid, detections.region)
+        true = true[here & (ab_magnitude(true[f"flux_{band}"]) < detections.settings.summary_magnitude)]
         matched = self.matched.load(index)
         matched = matched[matched["truth_id"] >= 0].sort_values(["separation", "objectId"])
         key = ["truth_id", "star"]
@@ -153,26 +137,19 @@ class SummariseTile:
         return joined[schema("truth_summary", bands).names]
 
 
-def _units(detections: ImageProduct, source: str, state: dict) -> tuple[Unit, ...]:
+def _units(detections: Detections, source: str, state: dict) -> tuple[Unit, ...]:
     """Return a unit a tile that reads the tile's unit of a stage and the truth on it."""
-    _, tiles, render = _makers(detections)
+    coadds, truth = detections.coadds, detections.truth
     return tuple(
-        Unit(tile.name, {"tile": tile.name, **state}, ((source, tile.name), *render.truth.inputs(*tile_cone(tiles, k))))
-        for k, tile in enumerate(tiles.tiles)
+        Unit(tile.name, {"tile": tile.name, **state}, ((source, tile.name), *truth.inputs(*tile_cone(coadds, k))))
+        for k, tile in enumerate(coadds.tiles)
     )
-
-
-def _makers(detections: ImageProduct) -> tuple[DetectTile, TileMaker, RenderExposure]:
-    maker = detections.make
-    assert isinstance(maker, DetectTile)
-    tiles = tile_maker(maker.coadds)
-    return maker, tiles, tiles.source
 
 
 TRUTH_MATCH = Stage(
     name="truth_match",
     per_survey=True,
-    build=lambda context, survey: truth_match(context.output(f"detections/{survey}"), context.pipeline.detections),
+    build=lambda context, survey: truth_match(context.output(f"detections/{survey}")),
     reads=("detections", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="tile",
@@ -183,7 +160,7 @@ TRUTH_SUMMARY = Stage(
     name="truth_summary",
     per_survey=True,
     build=lambda context, survey: truth_summary(
-        context.output(f"truth_match/{survey}"), context.output(f"detections/{survey}"), context.pipeline.detections
+        context.output(f"truth_match/{survey}"), context.output(f"detections/{survey}")
     ),
     reads=("truth_match", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,

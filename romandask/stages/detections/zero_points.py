@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 
 from romandask.model.spectra import ab_magnitude
-from romandask.products.images import ImageProduct
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.detections.detections import Detections
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 BRIGHT, FAINT = 17.0, 20.0
@@ -19,14 +19,14 @@ BRIGHT, FAINT = 17.0, 20.0
 FLUXES = ("kronFlux", "apFlux", "psfFlux")
 
 
-def zero_points(summary: TableProduct, detections: ImageProduct, bands: tuple[str, ...]) -> TableProduct:
+def zero_points(summary: TableProduct, detections: Detections) -> TableProduct:
     """Return the lazy offsets of a survey's magnitudes (schema: catalogs/zero_points.yaml): one unit, of all tiles.
 
     Stars that are one object without a flag count: saturated and blended ones do not. A tile that could not be made is
     left out.
     """
     sources = tuple((product.stage, name) for product in (summary, detections) for name in product.names)
-    name = detections.stage.split("/")[1]
+    name, bands = detections.instrument.name, detections.instrument.bands
     return TableProduct(
         f"zero_points/{name}",
         (Unit("all", {"bands": bands, "limits": [BRIGHT, FAINT]}, optional=sources),),
@@ -73,7 +73,7 @@ class MakeZeroPoints:
     """Makes the offsets of a survey."""
 
     summary: TableProduct
-    detections: ImageProduct
+    detections: Detections
     bands: tuple[str, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
@@ -81,13 +81,13 @@ class MakeZeroPoints:
         true = [f"flux_{band}" for band in self.bands]
         measured = [f"{band}_{flux}" for band in self.bands for flux in FLUXES]
         parts = [pd.DataFrame(columns=[*true, *measured], dtype=float)]
-        stored = self.detections.store is not None
+        stored = self.detections.product.store is not None
         for k in range(len(self.detections.units)):
             if stored and not (self.detections.has(k) and self.summary.has(k)):
                 continue
             summary = self.summary.load(k)
             summary = summary[summary["star"] & (summary["objects"] == 1)]
-            objects = self.detections.load(k, ("objects",))["objects"]
+            objects = self.detections.objects(k)
             objects = objects[objects["flags"] == 0]
             parts.append(summary[["objectId", *true]].merge(objects[["objectId", *measured]], on="objectId"))
         return offsets(pd.concat(parts, ignore_index=True), self.bands)
@@ -97,9 +97,7 @@ ZERO_POINTS = Stage(
     name="zero_points",
     per_survey=True,
     build=lambda context, survey: zero_points(
-        context.output(f"truth_summary/{survey}"),
-        context.output(f"detections/{survey}"),
-        context.instruments[survey].bands,
+        context.output(f"truth_summary/{survey}"), context.output(f"detections/{survey}")
     ),
     reads=("truth_summary", "detections"),
     units_known_after=UNITS_FROM_POINTINGS,

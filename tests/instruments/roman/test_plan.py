@@ -15,7 +15,7 @@ from astropy.wcs import WCS
 from coord.util import sun_position_ecliptic
 
 from romandask.ingest import obseq
-from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.focal_plane import move, separations
 from romandask.instruments.roman.plan import DITHER, LONG_STEP, SHORT_STEP
 from romandask.instruments.roman.roman import Roman, RomanPointings, RomanSettings

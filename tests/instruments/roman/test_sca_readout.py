@@ -12,8 +12,7 @@ from PIL import Image
 
 from romandask.engine.task import Task
 from romandask.engine.task_queue import TaskQueue
-from romandask.instruments.instrument import Exposure
-from romandask.instruments.roman.sca_effects import differences
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.sca_readout import DAY, age, before
 from romandask.kernels.detectors.sca import MEMORY
 from romandask.kernels.detectors.sca_exposure import (
@@ -155,13 +154,12 @@ def test_exposures_have_what_was_read_and_its_calibration(later):
 def test_persistence_is_what_the_exposure_before_left(later):
     survey, row, earlier = later
     product = survey.output("exposures/roman")
-    maker = product.make
-    left = maker.trapped(earlier)
+    renderer = product.renderer
+    left = renderer.left_by(earlier)
     # the same from the store and worked out again
-    pd.testing.assert_frame_equal(left, replace(maker, store=None).trapped(earlier))
-    view = maker.view(row)
-    light = maker.expected(view) + view.background
-    without = maker.readout(view.exposure, light, [])
+    pd.testing.assert_frame_equal(left, replace(renderer, store=None).left_by(earlier))
+    view = renderer.view(row)
+    without = renderer.readout(view, [])
     stored = product.load(row)
     before_it = Exposure(**vars(view.exposure) | {"mjd": survey.pointings("roman")["mjd"].iat[earlier]})
     expected = left["charge"].to_numpy() / age(before_it, view.exposure) * view.exposure.exptime
@@ -177,7 +175,7 @@ def test_persistence_is_what_the_exposure_before_left(later):
 
 def test_every_effect_shows_by_itself(later):
     survey, row, _ = later
-    found = {one.effect: one.image for one in differences(survey.output("exposures/roman"), row)}
+    found = survey.output("exposures/roman").effects(row)
     assert list(found) == [
         "quantum efficiency",
         "count-rate nonlinearity",

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from romandask.ingest import opsim
-from romandask.instruments.instrument import Exposure, exposure_of, footprint
+from romandask.instruments.exposure import Exposure, exposure_of, footprint
 from romandask.instruments.rubin import cadence as nights
 from romandask.instruments.rubin.depth import coadd_depth, depth_map, effective_fwhm, visit_depth
 from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import sep
 
-from romandask.instruments.instrument import Exposure, footprint
+from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.rubin.rubin import DEGREE, Rubin, RubinSettings
 from romandask.kernels.coadding.warp import REACH
 from romandask.kernels.rendering.psf import place_grid
@@ -19,7 +19,7 @@ from romandask.model.seeds import rng
 from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
 from romandask.stages.coadds.coadds import coadds
-from romandask.stages.exposures import exposures
+from romandask.stages.exposures.exposures import exposures
 from romandask.stages.pointings import CORNERS
 from romandask.stages.psf_images import flat_shares, psf_image
 from romandask.stages.truth.catalogs import truth
@@ -138,8 +138,7 @@ def test_an_exposure_has_what_was_read_and_its_calibration():
     again = survey("visits", every)[0].load(0)
     for name, plane in made.items():
         np.testing.assert_array_equal(plane, again[name])
-    maker = product.make
-    view = maker.view(0)
+    view = product.renderer.view(0)
     rays = (made["dq"] & 256) > 0
     assert 0 < rays.sum() < 0.01 * rays.size
     good = made["dq"] == 0
@@ -201,7 +200,7 @@ def test_bright_stars_are_fatter_through_silicon_and_keep_their_flux():
     for sensor in ("ideal", "silicon"):
         product, _, _ = survey("visits", visits(1), sensor=sensor, cosmic_rays=False)
         made[sensor] = product.make(0)
-    view = product.make.view(0)
+    view = product.renderer.view(0)
     scene, fluxes = view.drawable.scene, view.drawable.scene.fluxes()
     apart = np.hypot(scene.x[:, None] - scene.x, scene.y[:, None] - scene.y) + 1e9 * (fluxes < 0.05 * fluxes[:, None])
     np.fill_diagonal(apart, 1e9)

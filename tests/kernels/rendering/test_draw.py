@@ -8,7 +8,7 @@ import pytest
 from astropy.wcs import WCS
 
 from romandask.ingest.spectra import galaxy_templates
-from romandask.instruments.instrument import Exposure
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering import draw as render
 from romandask.kernels.rendering.draw import Scene, plan_stamps, stamp_sizes

@@ -8,7 +8,7 @@ import galsim.roman
 import numpy as np
 import pytest
 
-from romandask.instruments.instrument import Exposure
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering.draw import Scene, draw, plan_stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
@@ -118,11 +118,10 @@ def test_objects_of_every_kind_are_galsims(band):
 
 def test_a_whole_scene_is_what_the_second_engine_draws(small):
     """Every object on a detector at the sky's density, by both engines, through the same interface."""
-    source = small.product.make
-    view = source.view(0)
+    view = small.product.renderer.view(0)
     assert (view.stamps.size > 0).sum() > 150
-    ours = source.expected(view)
-    other = replace(source, render=RenderSettings(engine="galsim", n_waves=3)).expected(view)
+    ours = view.expected()
+    other = replace(view, render=RenderSettings(engine="galsim", n_waves=3)).expected()
     noise = small.roman.sky_noise(small.exposures[0], view.background)
     assert np.abs(ours - other).max() < 0.05 * noise
     assert ours.sum() == pytest.approx(other.sum(), rel=1e-3)

@@ -14,7 +14,7 @@ from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.blend_statistics import Samples, matrix, statistics
+from romandask.stages.analysis.blend_statistics import PairSample, Samples, matrix, statistics
 from romandask.stages.analysis.friends_of_friends import SHIFT, matches
 from romandask.stages.analysis.samples import limits, samples
 from romandask.storage.store import Store
@@ -124,11 +124,13 @@ def made(sky, settings: MatchSettings, folder):
         limit = stored(limits(*tables_of, settings, band))
         tables[name] = stored(samples(*tables_of, limit, settings, bands, band))
     groups = []
-    for kind in (("matches", 0.0), ("chance", SHIFT)):
-        groups.append(matches(tables, settings, REGION, store, *kind))
+    for kind in (("matches", {}), ("chance", {"rubin": SHIFT})):
+        groups.append(matches(tables, {"roman": 0, "rubin": 1}, settings, REGION, store, *kind))
         for product in vars(groups[-1]).values():
             stored(product)
-    known = Samples(tables, {"roman": "H158", "rubin": "i"}, truth, stars)
+    sharp = PairSample(table=tables["roman"], code=0, reference_band="H158", colour_band="F184")
+    blended = PairSample(table=tables["rubin"], code=1, reference_band="i", colour_band="g" if "g" in RUBIN else "i")
+    known = Samples(sharp=sharp, blended=blended, galaxies=truth, stars=stars)
     return tables, statistics(*groups, known, settings.linking_lengths)
 
 

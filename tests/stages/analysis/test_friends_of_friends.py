@@ -84,10 +84,14 @@ def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
     )
 
 
-def stored_matches(products, settings: MatchSettings, folder, kind: str = "matches", shift: float = 0.0) -> Matches:
+def codes_of(products) -> dict[str, int]:
+    return {name: code for code, name in enumerate(products)}
+
+
+def stored_matches(products, settings: MatchSettings, folder, kind: str = "matches", **shift: float) -> Matches:
     """Groups made stage by stage, each reading the stored one before."""
     store = Store(folder)
-    made = matches(products, settings, REGION, store, kind, shift)
+    made = matches(products, codes_of(products), settings, REGION, store, kind, shift)
     for product in (made.local, made.crossing, made.merged, made.groups):
         tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
         assert all(outcome.record for outcome in InProcess().run(Batch(product, tasks, store)))
@@ -141,7 +145,7 @@ def test_a_moved_survey_keeps_its_own_groups_and_loses_those_with_the_other(clum
     """Moved by more than a clump is wide, pairs are those of the moved positions: brute force says which."""
     roman, rubin = clumped
     products = {"roman": table("roman", roman, 11), "rubin": table("rubin", rubin, 11)}
-    made = stored_matches(products, MatchSettings(order=12), tmp_path, "chance", SHIFT)
+    made = stored_matches(products, MatchSettings(order=12), tmp_path, "chance", rubin=SHIFT)
     found = made.groups.all_rows()
     dec = np.concatenate(
         [roman["coord_dec"], rubin["coord_dec"] - np.where(rubin["coord_dec"] > 0, 1, -1) * SHIFT / 3600]
@@ -164,4 +168,4 @@ def test_no_objects_are_no_groups(tmp_path):
 def test_links_longer_than_what_is_looked_at_around_a_partition_are_refused():
     products = {"roman": table("roman", pd.DataFrame({"objectId": [1], "coord_ra": [0.0], "coord_dec": [0.0]}), 10)}
     with pytest.raises(UserError, match=r"linking_lengths: 60 arcsec, 5 at most"):
-        matches(products, MatchSettings(linking_lengths=(60.0,), order=12), REGION)
+        matches(products, codes_of(products), MatchSettings(linking_lengths=(60.0,), order=12), REGION)

@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy import ndimage
 
-from romandask.instruments.instrument import Exposure, pixel_areas
+from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
@@ -22,7 +22,8 @@ from romandask.model.tiles import tangent_header
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.coadds.drizzled import saturated_places
 from romandask.stages.coadds.pixfrac import CHOICES, TEST_SQUARE_PIXELS, advice, coverage
-from romandask.stages.exposures import RenderExposure, wcs_of
+from romandask.stages.exposures.exposures import wcs_of
+from romandask.stages.exposures.render import RenderExposure
 from romandask.storage.store import Store
 
 CALLS: list[int] = []
@@ -239,9 +240,8 @@ def test_hundreds_of_exposures_are_counted():
 
 @pytest.fixture(scope="module")
 def counted(small):
-    maker = small.product.make
-    render = Counting(maker.table, maker.truth, maker.instrument, maker.render, maker.seed)
-    return replace(small.product, make=render)
+    renderer = Counting(**vars(small.product.renderer))
+    return replace(small.product, product=replace(small.product.product, make=renderer), renderer=renderer)
 
 
 def test_a_lazy_corner_equals_the_stored_one_and_renders_only_what_it_needs(small, counted, tmp_path):

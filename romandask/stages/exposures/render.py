@@ -1,0 +1,181 @@
+"""Rendering one exposure: the scene that a detector looks at, drawn without noise, and read out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import galsim
+import numpy as np
+import pandas as pd
+from astropy.wcs import WCS
+
+from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.instrument import Instrument, Readout
+from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
+from romandask.kernels.rendering.galsim_engine import draw_objects
+from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
+from romandask.model.settings import RenderSettings
+from romandask.model.sky import radec, unit_vectors
+from romandask.products.images import table_beside
+from romandask.products.tables import to_frame
+from romandask.stages.pointings import corners_of
+from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.storage.manifest import read_record
+from romandask.storage.store import Store, read_parquet
+
+REACH = 30.0
+"""Arcsec outside a detector within which objects may shine on it."""
+STAR_REACH = 115.0
+"""The same for bright stars, whose diffraction spikes are long."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What an exposure looks at, ready to be drawn: the light before the detector."""
+
+    exposure: Exposure
+    instrument: Instrument
+    render: RenderSettings
+    header: dict
+    truth: Truth
+    drawable: Drawable
+    background: np.ndarray
+    """(ny, nx) expected electrons that do not come from objects."""
+    faintest: float
+    """Surface brightness, electrons a pixel, below which stamps may end."""
+    stamps: Stamps
+    """Of the drawable objects."""
+
+    @property
+    def scene(self) -> Scene:
+        """The drawable objects, in pixels and electrons."""
+        return self.drawable.scene
+
+    @property
+    def stamp_sizes(self) -> np.ndarray:
+        """(n,) pixels along a side of the stamp of each object; 0 for one that is not drawn."""
+        return self.stamps.size
+
+    def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
+        """Return the noiseless image (ny, nx), electrons, of the objects, or of those where `chosen` (n,) is true."""
+        instrument, exposure, stamps = self.instrument, self.exposure, self.stamps
+        if chosen is not None:
+            stamps = replace(stamps, size=np.where(chosen, stamps.size, 0))
+        if self.render.engine == "galsim":
+            profiles = Profiles(instrument, exposure)
+            return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
+        psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
+        return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
+
+    def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
+        """Return the cell of a position and GalSim's PSFs there, one a node."""
+        return Profiles(self.instrument, self.exposure)(x, y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderExposure:
+    """Makes the arrays of one exposure."""
+
+    table: pd.DataFrame
+    """The pointings."""
+    truth: TruthCatalogs
+    instrument: Instrument
+    render: RenderSettings
+    seed: int
+    readout: Readout
+    store: Store | None = None
+    """Where the tables that earlier exposures left may be."""
+
+    def view(self, index: int) -> View:
+        """Return what the exposure at a row of the pointings table looks at."""
+        exposure, instrument = exposure_of(self.table.iloc[index]), self.instrument
+        header = instrument.header(exposure)
+        truth = self.truth.near(*cone(corners_of(self.table.iloc[[index]])[0]))
+        drawable = build_scene(
+            truth,
+            WCS(header),
+            instrument.bandpass(exposure.band),
+            exposure.exptime,
+            instrument.knot_smoothing,
+            (instrument.shape, STAR_REACH / instrument.pixel_scale),
+        )
+        background = instrument.background(exposure, header)
+        faintest = self.render.truncation * instrument.sky_noise(exposure, background)
+        stamps = plan_stamps(
+            drawable.scene,
+            instrument.psf_edges(exposure),
+            instrument.shape,
+            faintest,
+            self.render.largest,
+            instrument.bright_psfs(exposure),
+        )
+        return View(
+            exposure=exposure,
+            instrument=instrument,
+            render=self.render,
+            header=header,
+            truth=truth,
+            drawable=drawable,
+            background=background,
+            faintest=faintest,
+            stamps=stamps,
+        )
+
+    def __call__(self, index: int) -> dict[str, Any]:
+        """Return the arrays of the exposure at a row of the pointings table, by name, and its tables."""
+        return self.readout(self.view(index), self.left(index))
+
+    def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
+        """Return the earlier exposures that leave charge in an exposure, each with the table of what it left."""
+        rows = self.readout.earlier(self.table, index).tolist()
+        return [(exposure_of(self.table.iloc[row]), self.left_by(row)) for row in rows]
+
+    def left_by(self, index: int) -> pd.DataFrame:
+        """Return what an exposure left: read where it is stored, worked out where not."""
+        exposure, stage = exposure_of(self.table.iloc[index]), stage_of(self.instrument)
+        if self.store is not None and read_record(self.store, stage, exposure.name):
+            (table,) = self.readout.tables
+            return to_frame(read_parquet(table_beside(self.store, stage, table, exposure.name)))
+        return self.readout.leave(self.view(index))
+
+
+@dataclass(frozen=True, eq=False)
+class Profiles:
+    """GalSim's PSFs of an exposure, one a node, on a coarse grid of cells: what the GalSim engine draws with."""
+
+    instrument: Instrument
+    exposure: Exposure
+    cells: int = 4
+    """Along each side of the detector; an object has the PSF of the middle of its cell."""
+
+    def __call__(self, x: float, y: float) -> tuple[tuple[int, int], list[galsim.GSObject]]:
+        """Return the cell of a position and the PSFs there."""
+        i, j = (
+            int(np.clip(value * self.cells // side, 0, self.cells - 1))
+            for value, side in zip((x, y), self.instrument.shape[::-1], strict=True)
+        )
+        return (i, j), _cell_profiles(self, i, j)
+
+
+@lru_cache(maxsize=2)
+def _cell_profiles(profiles: Profiles, i: int, j: int) -> list[galsim.GSObject]:
+    ny, nx = profiles.instrument.shape
+    x, y = (i + 0.5) * nx / profiles.cells - 0.5, (j + 0.5) * ny / profiles.cells - 0.5
+    return profiles.instrument.profiles(profiles.exposure, x, y)
+
+
+def stage_of(instrument: Instrument) -> str:
+    """Return the name of the product of an instrument's exposures."""
+    return f"exposures/{instrument.name}"
+
+
+def cone(corners: np.ndarray) -> tuple[float, float, float, float]:
+    """Return centre and radii (degrees) of the cones around a footprint from which galaxies and stars shine on it."""
+    vectors = unit_vectors(corners[:, 0], corners[:, 1])
+    centre = vectors.sum(axis=0)
+    centre /= np.linalg.norm(centre)
+    ra, dec = radec(centre)
+    radius = np.degrees(2 * np.arcsin(np.linalg.norm(vectors - centre, axis=1).max() / 2))
+    return float(ra), float(dec), float(radius + REACH / 3600), float(radius + STAR_REACH / 3600)

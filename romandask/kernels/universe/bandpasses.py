@@ -45,4 +45,10 @@ def sampled(name: str, bandpass: galsim.Bandpass, area: float, n_waves: int) -> 
     # tails below a thousandth of the peak hold light but would only spread the nodes
     trimmed = bandpass.truncate(relative_throughput=1e-3)
     nodes = np.linspace(trimmed.blue_limit, trimmed.red_limit, n_waves)
-    return Bandpass(name, wave, (throughput * steps).sum(axis=1) / widths, area, nodes)
+    return Bandpass(
+        name=name,
+        wave=wave,
+        throughput=(throughput * steps).sum(axis=1) / widths,
+        area=area,
+        nodes=nodes,
+    )

@@ -18,7 +18,7 @@ from romandask.kernels.universe.population import Population, population
 from romandask.kernels.universe.structure import Structure
 from romandask.model.cosmology import Cosmology
 from romandask.model.seeds import rng
-from romandask.model.sky import ARCSEC, cell_area, displaced
+from romandask.model.sky import ARCSEC, cell_area, offset_positions
 
 CELL_ORDER = 12
 """HEALPix order of the cells that are generated at a time, 51.5 arcsec wide."""
@@ -120,7 +120,7 @@ def _satellites(hosts: Galaxies, members: np.ndarray, in_cell: np.ndarray, cells
     distance = Cosmology().angular_diameter_distance(hosts.redshift[host])
     radius = np.minimum(counts.GROUP_RADIUS / distance, REACH * ARCSEC) * uniform[:, RICHNESS] ** counts.CONCENTRATION
     bearing = 2 * np.pi * uniform[:, SATELLITES]
-    ra, dec = displaced(hosts.ra[host], hosts.dec[host], radius, bearing)
+    ra, dec = offset_positions(hosts.ra[host], hosts.dec[host], radius, bearing)
     # velocities about the host's, 300 km/s
     redshift = hosts.redshift[host]
     redshift = np.clip(redshift + (1 + redshift) * 1e-3 * ndtri(uniform[:, REDSHIFT]), 0.005, 3.0)

@@ -22,7 +22,7 @@ from romandask.kernels.universe.population import (
 )
 from romandask.kernels.universe.structure import bias, shell_spectra, shells, structure
 from romandask.model.cosmology import Cosmology
-from romandask.model.sky import Region, displaced, unit_vectors
+from romandask.model.sky import Region, offset_positions, unit_vectors
 
 NSIDE = 128
 REGION = Region(50.0, 50.8, -0.4, 0.4)
@@ -262,7 +262,9 @@ def test_magnitudes_in_r_are_those_that_were_drawn(sky):
 
 
 def test_satellites_lie_around_their_hosts_on_the_sphere():
-    ra, dec = displaced(np.array([0.001, 200.0]), np.array([-30.0, 89.999]), np.radians(0.01), np.array([4.0, 1.0]))
+    ra, dec = offset_positions(
+        np.array([0.001, 200.0]), np.array([-30.0, 89.999]), np.radians(0.01), np.array([4.0, 1.0])
+    )
     gap = np.linalg.norm(unit_vectors(ra, dec) - unit_vectors([0.001, 200.0], [-30.0, 89.999]), axis=1)
     np.testing.assert_allclose(gap, np.radians(0.01), rtol=1e-8)
 

@@ -14,7 +14,7 @@ from astropy.wcs import WCS
 
 from romandask.instruments.instrument import exposure_of
 from romandask.kernels.detectors.simple_detector import NO_DATA, usable
-from romandask.kernels.rendering.psf import fine_image
+from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.kernels.rendering.scene import pixel_positions
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs

@@ -25,7 +25,7 @@ from romandask.kernels.detectors.simple_detector import DQ_FLAGS, Detector, obse
 from romandask.kernels.rendering.draw import Stamps, draw, plan_stamps
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
-from romandask.kernels.rendering.silicon import LEAST, through_silicon
+from romandask.kernels.rendering.silicon import MIN_ELECTRONS, through_silicon
 from romandask.model.seeds import rng
 from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
@@ -126,7 +126,7 @@ class RenderExposure:
     def through_ccd(self, view: View, readout: CcdReadout) -> dict[str, Any]:
         """Return the arrays of an exposure of a CCD, its bright objects photon by photon where that is asked for."""
         exposure, instrument, scene = view.exposure, readout.instrument, view.drawable.scene
-        bright = (scene.fluxes() >= LEAST) & (view.stamps.size > 0)
+        bright = (scene.fluxes() >= MIN_ELECTRONS) & (view.stamps.size > 0)
         if instrument.settings.sensor == "ideal" or not bright.any():
             expected = self.expected(view)
             return {**readout(exposure, expected, view.background, None), "truth": expected}

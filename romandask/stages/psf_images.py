@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from romandask.instruments.instrument import Exposure, Instrument, exposure_of
-from romandask.kernels.rendering.psf import fine_image
+from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.images import ImageProduct
 from romandask.products.units import LazyUnits, Unit

@@ -51,7 +51,7 @@ COLUMNS = 17
 
 @dataclass(frozen=True, kw_only=True)
 class Galaxies:
-    """n generated galaxies, with the uniform random numbers that decide their other properties."""
+    """Generated galaxies, n in number, with the random numbers that decide their other properties."""
 
     id: np.ndarray
     """Cell number times 2^24, plus the number of the galaxy in the cell; a satellite counts in the cell of its host."""

@@ -250,7 +250,7 @@ class RunSettings(Section):
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML loader that rejects duplicate keys, of which the base class keeps the last without a warning."""
+    """Safe YAML loader that rejects duplicate keys; the base class silently keeps the last value."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys: set[str] = set()

@@ -16,7 +16,7 @@ from romandask.model.errors import UserError
 ARCSEC = np.pi / 180 / 3600
 """One arcsecond in radians."""
 MAX_CELLS = 1_000_000
-"""Largest number of HEALPix cells of a region, that is of catalog partitions, each of which is planned separately."""
+"""Largest number of HEALPix cells of a region; each cell is a catalog partition, which is planned separately."""
 _PAIRS_PER_BATCH = 200_000
 """Number of polygon pairs that are compared at a time; takes some tens of megabytes."""
 _FOOTPRINTS_PER_BATCH = 20_000

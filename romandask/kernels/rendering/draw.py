@@ -39,7 +39,7 @@ _PSF_TOLERANCE = 3e-4
 
 @dataclass(frozen=True)
 class Scene:
-    """n objects on one image, made of c components, which are sorted by object."""
+    """The n objects on one image and their c components, which are sorted by object."""
 
     x: np.ndarray
     """Pixel coordinate along x, 0 at the centre of the first pixel, shape (n,)."""

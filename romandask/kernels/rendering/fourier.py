@@ -36,7 +36,7 @@ _CELLS = _OCTAVES << _CELL_BITS
 
 @dataclass(frozen=True)
 class Frequencies:
-    """The modes of a PSF at those frequencies of one stamp size at which it has power.
+    """The modes of a PSF at the frequencies of one stamp size at which the PSF has power.
 
     Frequencies are 2 pi (j_x, j_y) / size, with rows j_y = -reach, ..., reach - 1 and columns j_x = 0, 1, ... of each
     row, one row after the other in flat arrays.

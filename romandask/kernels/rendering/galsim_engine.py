@@ -1,4 +1,4 @@
-"""Rendering with GalSim, one object at a time, by FFT: slow, but independent of the Fourier renderer, its reference."""
+"""Reference renderer: GalSim draws one object at a time by FFT; slow, but independent of the Fourier renderer."""
 
 from __future__ import annotations
 

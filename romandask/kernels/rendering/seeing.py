@@ -170,7 +170,7 @@ def elliptical_model(
     frequency: np.ndarray,
     transfers: np.ndarray,
     middle: np.ndarray,
-    places: np.ndarray,
+    covariances: np.ndarray,
     degree: int,
     shape: tuple[int, int],
     pixel_scale: float,
@@ -186,7 +186,7 @@ def elliptical_model(
         Transform of the round PSF at each node.
     middle : array, shape (3,), arcsec2
         Covariance xx, yy, xy in the middle of the detector.
-    places : array, shape (positions, 3), arcsec2
+    covariances : array, shape (positions, 3), arcsec2
         Covariances at the positions of `place_grid`; empty for a PSF that does not vary over the detector.
     degree : int
         Degree of `place_grid`.
@@ -200,12 +200,13 @@ def elliptical_model(
     grid = Grid(size, 2)
     round_part = _round(frequency, transfers, grid, pixel_scale)
     nodes = round_part * _gaussian(middle, grid, pixel_scale)
-    if not len(places):
+    if not len(covariances):
         return model(nodes, grid)
     core = Grid(min(size, CORE), 2)
     inner = grid.within(round_part, core.size)
     in_middle = _gaussian(middle, core, pixel_scale)
-    differences = np.stack([inner * (_gaussian(place, core, pixel_scale) - in_middle) for place in places], axis=1)
+    gaussians = [_gaussian(covariance, core, pixel_scale) for covariance in covariances]
+    differences = np.stack([inner * (gaussian - in_middle) for gaussian in gaussians], axis=1)
     return model(nodes, grid, Variation(shape, degree, differences))
 
 

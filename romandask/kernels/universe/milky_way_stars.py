@@ -198,5 +198,5 @@ def _magnitudes(line: Sightline, uniform_1: np.ndarray, uniform_2: np.ndarray) -
     bin_index = np.minimum(position.astype(int), len(cumulative) - 2)
     row, column = np.divmod(bin_index, line.counts.shape[1])
     apparent = line.edges[row] + uniform_2 * np.diff(line.edges)[row]
-    # the fractional part of the position is the place of the star in its bin of M_r
+    # the fractional part of the position is the position of the star in its bin of M_r
     return apparent, line.absolute_magnitudes[column] + 0.1 * (position - bin_index - 0.5)

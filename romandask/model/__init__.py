@@ -1,1 +1,1 @@
-"""Frozen values and arithmetic: no dask, no instrument."""
+"""Immutable values and plain arithmetic, independent of dask and of the instruments."""

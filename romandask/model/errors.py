@@ -1,10 +1,11 @@
-"""The one exception for a mistake that the user can mend."""
+"""The exception for errors that the user can correct."""
 
 from __future__ import annotations
 
 
 class UserError(Exception):
-    """A wrong input: names the file, column or key, what was found and what to do.
+    """An error in the user's input or settings.
 
-    The command line prints it as one line and ends with exit code 2; nothing has been written.
+    The message names the file, column or key, the value that was found, and what to do. The command line prints it as
+    one line and exits with code 2; nothing has been written.
     """

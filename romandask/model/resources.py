@@ -1,4 +1,4 @@
-"""Where the pipelines, catalog schemas and pages are: beside the package in a checkout, inside it once installed."""
+"""Location of the pipelines, catalog schemas and pages: next to the package in a checkout, inside it once installed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def resource_folder(name: str) -> Path:
-    """Return the folder `pipelines`, `catalogs` or `pages`."""
+    """Return the path of the folder `pipelines`, `catalogs` or `pages`."""
     inside = _PACKAGE / name
     return inside if inside.is_dir() else _PACKAGE.parent / name

@@ -1,4 +1,4 @@
-"""Random generators seeded from identity, never from order."""
+"""Random generators seeded by what they are used for, independent of the order of execution."""
 
 from __future__ import annotations
 
@@ -9,11 +9,22 @@ import numpy as np
 
 
 def rng(seed: int, stage: str, *identity: int | str) -> np.random.Generator:
-    """Return the generator that belongs to one thing of one survey.
+    """Return the random generator of one item of a survey.
 
-    The identity (stage, then for example survey, visit, detector) is hashed to 128 bits, so two things never
-    share a stream because sums or products of their numbers agree, and the order of making does not matter.
+    The stage and the identity are hashed to 128 bits. Two items therefore never share a random stream because the
+    sums or products of their numbers agree, and the order in which items are made does not matter.
 
+    Parameters
+    ----------
+    seed : int
+        Seed of the survey.
+    stage : str
+        Name of the stage.
+    *identity : int or str
+        Identity of the item within the stage, for example instrument, visit and detector.
+
+    Examples
+    --------
     >>> float(rng(1, "exposures", "roman", 7, 3).random()) == float(rng(1, "exposures", "roman", 3, 7).random())
     False
     """
@@ -24,5 +35,5 @@ def rng(seed: int, stage: str, *identity: int | str) -> np.random.Generator:
 
 
 def realisation_key(realisation: int) -> tuple[int, ...]:
-    """Return what tells the random numbers of a noise realisation from those of the first."""
+    """Return the part of the identity in `rng` that stands for a noise realisation; empty for realisation 0."""
     return (realisation,) if realisation else ()

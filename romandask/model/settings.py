@@ -1,6 +1,6 @@
-"""Settings of the stages that all instruments share, and how YAML and `key=value` text become settings.
+"""Settings of the stages that all instruments share, and the parsing of YAML files and `key=value` overrides.
 
-Values only: user text reaches YAML's safe loader and pydantic, nothing that evaluates code.
+User text is parsed by YAML's safe loader and validated by pydantic; it is never evaluated as code.
 """
 
 from __future__ import annotations
@@ -22,16 +22,22 @@ from romandask.model.tiles import TileGrid
 
 
 class Section(BaseModel):
-    """A part of a pipeline file: frozen, and unknown keys are errors."""
+    """Base class of the sections of a pipeline file: immutable; unknown keys and non-finite numbers are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return values of which none is there twice."""
-    again = [value for k, value in enumerate(values) if value in values[:k]]
-    if again:
-        raise ValueError(f"{again[0]} is there twice")
+    """Return the values unchanged if no two are equal; a pydantic validator.
+
+    Raises
+    ------
+    ValueError
+        If a value is repeated.
+    """
+    repeated = [value for k, value in enumerate(values) if value in values[:k]]
+    if repeated:
+        raise ValueError(f"{repeated[0]} is there twice")
     return values
 
 
@@ -49,10 +55,13 @@ def one_of(names: Iterable[str]) -> Callable[[str], str]:
 
 
 class RegionSettings(Section):
-    """The patch of sky that the survey covers: a box; ra may cross 0 (then the first value is the larger)."""
+    """The survey's region: a box in right ascension and declination.
 
-    ra: tuple[float, float] = Field(description="right ascension from, to; degrees")
-    dec: tuple[float, float] = Field(description="declination from, to; degrees")
+    If the box crosses right ascension 0, the first value of `ra` is larger than the second.
+    """
+
+    ra: tuple[float, float] = Field(description="lower and upper right ascension, degrees")
+    dec: tuple[float, float] = Field(description="lower and upper declination, degrees")
 
     @model_validator(mode="after")
     def _ordered(self) -> RegionSettings:
@@ -63,43 +72,52 @@ class RegionSettings(Section):
         return self
 
     def region(self) -> Region:
-        """Return the box as a value."""
+        """Return the box as a `Region`."""
         return Region(self.ra[0], self.ra[1], self.dec[0], self.dec[1])
 
 
 class TableSettings(Section):
-    """A Parquet or FITS table of galaxies or of stars."""
+    """A user-supplied Parquet or FITS table of galaxies or of stars."""
 
-    path: str = Field(description="file, or folder of Parquet files, below `data`")
+    path: str = Field(description="file, or folder of Parquet files; relative to `data`")
     columns: dict[str, float | str] = Field(
-        description="by column of ours the file's column, a number for all rows, or a text after '='"
+        description="for each truth catalog column: the name of the file's column, a number used for all rows, or "
+        "'=' followed by a text used for all rows"
     )
 
 
 class TruthSettings(Section):
-    """Where galaxies and stars come from."""
+    """The truth catalogs: the source of galaxies and stars."""
 
     source: Literal["generate", "skycatalogs", "instance_catalog", "table"] = "generate"
-    path: str | None = Field(None, description="folder or file of the source catalog, below `data`")
-    galaxy_table: TableSettings | None = Field(None, description="galaxies, with source: table")
-    star_table: TableSettings | None = Field(None, description="stars, with source: table")
-    seds: str | None = Field(None, description="folder of spectra that the catalog names, below `data`")
-    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
-    margin: float = Field(20.0, ge=0, le=3600, description="objects this far outside the region are kept, arcsec")
-    galaxies: float = Field(597.2, ge=0, description="galaxies to r < 29, per square arcminute")
-    stars: float = Field(3.96, ge=0, description="stars to r < 29, per square arcminute")
+    path: str | None = Field(None, description="folder or file of the source catalog; relative to `data`")
+    galaxy_table: TableSettings | None = Field(None, description="table of galaxies, with source: table")
+    star_table: TableSettings | None = Field(None, description="table of stars, with source: table")
+    seds: str | None = Field(None, description="folder of the spectra named in the catalog; relative to `data`")
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the catalog partitions")
+    margin: float = Field(
+        20.0, ge=0, le=3600, description="distance outside the region to which objects are kept, arcsec"
+    )
+    galaxies: float = Field(597.2, ge=0, description="generated galaxies with r < 29 per square arcminute")
+    stars: float = Field(3.96, ge=0, description="generated stars with r < 29 per square arcminute")
     star_seds: str | None = Field(
-        None, description="folder of spectra for generated stars, below `data`; blackbodies where there is none"
+        None,
+        description="folder of spectra for generated stars; relative to `data`; blackbody spectra are used if not set",
     )
     nside: Literal[64, 128, 256, 512, 1024, 2048, 4096] = Field(
-        1024, description="HEALPix resolution of the matter shells, power of two"
+        1024, description="HEALPix nside of the matter shells, a power of two"
     )
     shear: tuple[float, float] = Field(
-        (0.0, 0.0), description="constant shear (gamma_1, gamma_2) added to the generated universe, all else the same"
+        (0.0, 0.0),
+        description="constant shear (gamma_1, gamma_2) added to the shear of the generated universe; nothing else "
+        "changes",
     )
-    milky_way_av: float = Field(0.03, ge=0, le=3, description="A_V of the Milky Way before generated objects, mag")
+    milky_way_av: float = Field(
+        0.03, ge=0, le=3, description="Milky Way extinction A_V in front of generated objects, mag"
+    )
     dust: Literal["physical", "troxel2023"] = Field(
-        "physical", description="internal dust in the rest frame, or in the observed frame as the paper did"
+        "physical",
+        description="frame of the internal dust; physical: rest frame, troxel2023: observed frame, as in the paper",
     )
 
     @model_validator(mode="after")
@@ -114,26 +132,37 @@ class TruthSettings(Section):
 
 
 class RenderSettings(Section):
-    """How light is drawn."""
+    """Rendering of galaxies and stars."""
 
     engine: Literal["fourier", "galsim"] = Field(
-        "fourier", description="batched drawing in Fourier space, or GalSim object by object, a hundred times slower"
+        "fourier",
+        description="fourier: batched drawing in Fourier space; galsim: GalSim, one object at a time, a hundred times "
+        "slower",
     )
-    n_waves: int = Field(5, ge=2, le=20, description="PSFs across a band between which the PSF is interpolated")
+    n_waves: int = Field(
+        5,
+        ge=2,
+        le=20,
+        description="number of wavelengths per band at which the PSF is computed; it is interpolated linearly between",
+    )
     truncation: float = Field(
-        0.04, gt=0, description="surface brightness at a stamp's edge, in units of the sky noise of a pixel"
+        0.04, gt=0, description="surface brightness at the edge of a stamp, in units of the sky noise of a pixel"
     )
     largest: int = Field(2048, ge=64, le=4096, description="largest stamp, pixels a side (a power of two)")
 
 
 class CoaddSettings(Section):
-    """The tile grid and the resampling; pixels are those of the finest instrument."""
+    """The tile grid and the coaddition.
 
-    scale: float = Field(0.0575, gt=0, description="pixel scale that `pixels` and `overlap` count in, arcsec")
+    `pixels` and `overlap` count pixels of the instrument with the finest coadd pixels. All instruments share the tile
+    grid in arcsec.
+    """
+
+    scale: float = Field(0.0575, gt=0, description="size of the pixels in which `pixels` and `overlap` count, arcsec")
     pixels: int = Field(8825, gt=32, description="side of a padded tile, pixels")
-    overlap: int = Field(500, ge=0, description="padding on every edge, pixels")
-    pixfrac: float = Field(0.7, gt=0, le=1, description="drop size over input pixel")
-    noise: int = Field(1, ge=1, le=20, description="noise realisations of each tile and band")
+    overlap: int = Field(500, ge=0, description="padding on each edge of a tile, pixels")
+    pixfrac: float = Field(0.7, gt=0, le=1, description="drizzle drop size, in units of the input pixel")
+    noise: int = Field(1, ge=1, le=20, description="number of noise realisations of each tile and band")
 
     @model_validator(mode="after")
     def _has_inside(self) -> CoaddSettings:
@@ -147,53 +176,77 @@ class CoaddSettings(Section):
 
 
 class DetectionSettings(Section):
-    """Source Extractor's settings (Troxel et al. 2023, section 4.5); Rubin's peaks need the first two and `min_snr`."""
+    """Source detection and measurement with Source Extractor (Troxel et al. 2023, section 4.5).
 
-    threshold: float = Field(2.5, gt=0, description="of objects' pixels: sigma of one; in Rubin's PSF-smoothed image")
-    min_area: int = Field(5, ge=1, description="least number of connected pixels")
-    deblend_levels: int = Field(48, ge=1)
-    deblend_contrast: float = Field(0.05, ge=0)
-    match_radius: float = Field(1.0, gt=0, le=10, description="of an object's true counterpart, arcsec")
-    summary_magnitude: float = Field(28.0, description="true objects fainter than this (H158, i) are not summarised")
-    min_snr: float = Field(
-        5.0, ge=0, description="least signal to noise in the detection image: of the Kron flux; of Rubin's, of the peak"
+    The detection of peaks for Rubin uses only `threshold`, `min_area` and `min_snr`.
+    """
+
+    threshold: float = Field(
+        2.5,
+        gt=0,
+        description="detection threshold of a pixel, in units of the pixel noise; for Rubin, in the image smoothed "
+        "with the PSF",
     )
-    order: int = Field(8, ge=3, le=12, description="HEALPix order of the object tables' partitions")
+    min_area: int = Field(5, ge=1, description="minimum number of connected pixels of an object")
+    deblend_levels: int = Field(48, ge=1, description="number of deblending thresholds")
+    deblend_contrast: float = Field(0.05, ge=0, description="minimum contrast for deblending")
+    match_radius: float = Field(
+        1.0, gt=0, le=10, description="largest distance of an object from its true counterpart, arcsec"
+    )
+    summary_magnitude: float = Field(
+        28.0, description="faintest magnitude (H158, i) of the true objects in the summaries"
+    )
+    min_snr: float = Field(
+        5.0,
+        ge=0,
+        description="minimum signal-to-noise ratio in the detection image: of the Kron flux; for Rubin, of the peak",
+    )
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions of the object tables")
 
 
 class MatchSettings(Section):
-    """Friends of friends over the samples of two surveys."""
+    """Friends-of-friends matching of the object samples of two surveys."""
 
     surveys: tuple[str, str] | None = Field(
         None, description="the sharp survey and the blended one; those that declare these parts if not given"
     )
     linking_lengths: Annotated[tuple[Annotated[float, Field(gt=0)], ...], AfterValidator(distinct)] = Field(
-        (1.0, 0.5), min_length=1, description="arcsec"
+        (1.0, 0.5), min_length=1, description="linking lengths, arcsec"
     )
     sample: Literal["clean", "all"] = Field(
-        "clean", description="clean: unflagged objects with a true counterpart, to the limits; all: every object"
+        "clean",
+        description="clean: unflagged objects with a true counterpart, brighter than the limits; all: every object",
     )
     limits: dict[str, float] | None = Field(
-        None, description="faintest magnitude by reference band (H158, i); where counts fall to 80% if not given"
+        None,
+        description="faintest magnitude for each reference band (H158, i); if not set, where the counts fall to "
+        "80% of a power law",
     )
-    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions")
+    order: int = Field(8, ge=3, le=12, description="HEALPix order of the partitions of the match tables")
 
 
 class DifferenceSettings(Section):
-    """Difference images: Rubin's tiles less Roman's, where the survey has both bands."""
+    """Difference images of two surveys' coadds; made if the survey has both bands."""
 
-    template: str = Field("Y106", description="band of the sharper survey")
-    science: str = Field("y", description="band of the other survey, from which it is taken away")
-    min_snr: float = Field(20.0, gt=0, description="of objects by which both are matched, and whose residuals are told")
+    template: str = Field("Y106", description="band of the template, the sharper survey's coadd that is subtracted")
+    science: str = Field("y", description="band of the science image, the coadd that the template is subtracted from")
+    min_snr: float = Field(
+        20.0,
+        gt=0,
+        description="minimum signal-to-noise ratio of the objects that the two images are matched with and whose "
+        "residuals are reported",
+    )
 
 
 class LensingSettings(Section):
-    """Two-point functions of shear (Troxel et al. 2023, section 6.2)."""
+    """Shear two-point correlation functions (Troxel et al. 2023, section 6.2)."""
 
-    min_separation: float = Field(2.5, gt=0, description="arcmin")
-    max_separation: float = Field(250.0, gt=0, description="arcmin; of a smaller region half its side")
-    bins: int = Field(20, ge=1, le=100, description="logarithmic, between the two")
-    patches: int = Field(40, ge=2, le=1000, description="of the sky, for the jackknife")
+    min_separation: float = Field(2.5, gt=0, description="smallest separation, arcmin")
+    max_separation: float = Field(
+        250.0, gt=0, description="largest separation, arcmin; at most half the shorter side of the region is used"
+    )
+    bins: int = Field(20, ge=1, le=100, description="number of logarithmic bins between the two separations")
+    patches: int = Field(40, ge=2, le=1000, description="number of sky patches for the jackknife")
 
     @model_validator(mode="after")
     def _has_order(self) -> LensingSettings:
@@ -203,35 +256,41 @@ class LensingSettings(Section):
 
 
 class RunSettings(Section):
-    """The local cluster."""
+    """The local dask cluster."""
 
-    workers: int = Field(2, ge=1)
-    memory_limit: float = Field(2.0, gt=0.5, description="GiB a worker")
+    workers: int = Field(2, ge=1, description="number of worker processes")
+    memory_limit: float = Field(2.0, gt=0.5, description="memory limit of each worker, GiB")
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values only; a key that is there twice is a mistake, not the last of the two."""
+    """Safe YAML loader that rejects duplicate keys; the base class silently keeps the last value."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        found: set[str] = set()
+        keys: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
-                if key.value in found:
+                if key.value in keys:
                     raise yaml.MarkedYAMLError(problem=f"{key.value} is there twice", problem_mark=key.start_mark)
-                found.add(key.value)
+                keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping that a YAML file holds; UserError where it holds none."""
+    """Return the top-level mapping of a YAML file.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, is not valid YAML, repeats a key, or holds anything but a mapping.
+    """
     try:
         text = path.read_text()
         content = yaml.load(text, _Loader)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f" at line {where.line + 1}" if where else ""
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark else ""
         raise UserError(f"{path}: not valid YAML{line} ({getattr(error, 'problem', 'not text')})") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds {type(content).__name__}, expected a mapping of settings")
@@ -239,7 +298,20 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def apply_overrides(content: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
-    """Return the settings with `section.key=value` texts applied; values are read as YAML."""
+    """Return a copy of the settings with overrides applied.
+
+    Parameters
+    ----------
+    content : dict
+        Nested settings, as read from a pipeline file.
+    overrides : list of str
+        Overrides of the form ``section.key=value``; values are parsed as YAML.
+
+    Raises
+    ------
+    UserError
+        If an override has another form, its value is not valid YAML, or it sets a key below a plain value.
+    """
     result = _copy(content)
     for override in overrides:
         key, separator, text = override.partition("=")
@@ -249,26 +321,42 @@ def apply_overrides(content: dict[str, Any], overrides: list[str]) -> dict[str, 
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             raise UserError(f"{override!r}: {text!r} is not a valid value") from None
-        place = result
+        section = result
         *parents, last = key.strip().split(".")
         for parent in parents:
-            place = place.setdefault(parent, {})
-            if not isinstance(place, dict):
+            section = section.setdefault(parent, {})
+            if not isinstance(section, dict):
                 raise UserError(f"{override!r}: {parent} holds a value, not a section")
-        place[last] = value
+        section[last] = value
     return result
 
 
 def validate(model: type[Section], content: dict[str, Any], source: str) -> Any:
-    """Return the settings, or raise one UserError that names every wrong key of `source`."""
+    """Return the validated settings.
+
+    Parameters
+    ----------
+    model : type
+        Section class of the settings.
+    content : dict
+        Nested settings, as read from a pipeline file, with overrides applied.
+    source : str
+        Name of the pipeline file, for the message of an error.
+
+    Raises
+    ------
+    UserError
+        If any setting is wrong; one message names every wrong key.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        lines = [_explain(model, item) for item in error.errors(include_url=False)]
-        raise UserError(f"{source}: " + "; ".join(lines)) from None
+        problems = [_explain(model, item) for item in error.errors(include_url=False)]
+        raise UserError(f"{source}: " + "; ".join(problems)) from None
 
 
 def _explain(model: type[Section], item: Any) -> str:
+    """Return the message for one of pydantic's errors."""
     location = [str(part) for part in item["loc"]]
     key = ".".join(location)
     if item["type"] == "extra_forbidden":
@@ -294,10 +382,12 @@ def _keys_at(model: type[BaseModel], location: list[str]) -> list[str]:
 
 
 def _section_of(annotation: Any) -> type[BaseModel] | None:
+    """Return the section class in a field's annotation, or None if it holds plain values."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return next((found for arg in typing.get_args(annotation) if (found := _section_of(arg))), None)
+        return next((section for arg in typing.get_args(annotation) if (section := _section_of(arg))), None)
     return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
 
 
 def _copy(content: Any) -> Any:
+    """Return a copy of nested mappings; other values are shared."""
     return {key: _copy(value) for key, value in content.items()} if isinstance(content, dict) else content

@@ -1,4 +1,4 @@
-"""Spectra and bandpasses as arrays on a wavelength grid."""
+"""Spectra and bandpasses as arrays on a common wavelength grid."""
 
 from __future__ import annotations
 
@@ -8,129 +8,141 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 PLANCK_C = 1.98644586e-16
-"""h c in erg cm; with wavelengths in nm the energy of a photon is PLANCK_C / (1e-7 wave) erg."""
+"""h c, erg cm; the energy of a photon of wavelength `wave` in nm is PLANCK_C / (1e-7 wave) erg."""
 
 NJY_ZERO_POINT = 3.631e12
 """Flux density of AB magnitude 0, nJy."""
 
 MAGNORM_WAVE = 500.0
-"""Wavelength, nm, of the rest-frame top-hat that `magnorm` refers to."""
-
+"""Rest-frame wavelength, nm, of the narrow top-hat band in which `magnorm` is the AB magnitude."""
 
 LOG_STEP = 1e-3
-"""Step in ln(wavelength) of every spectrum and bandpass: cell j holds wavelengths around exp(j LOG_STEP) nm, so that a
-redshift moves a spectrum by one and the same number of cells everywhere."""
+"""Step of the common grid in ln(wavelength). Cell j is centred on exp(j LOG_STEP) nm, so a redshift shifts all
+wavelengths of a spectrum by the same number of cells."""
 
 
 def log_grid(low: float, high: float) -> np.ndarray:
-    """Return the centres, nm, of the cells from that of `low` to that of `high`, both included."""
+    """Return the centres, nm, of the cells from the one that contains `low` to the one that contains `high`."""
     first, last = (int(round(np.log(value) / LOG_STEP)) for value in (low, high))
     return np.exp(np.arange(first, last + 1) * LOG_STEP)
 
 
 def cell_widths(wave: np.ndarray) -> np.ndarray:
-    """Return the widths, nm, of cells with these centres."""
+    """Return the widths, nm, of the cells of the common grid with the given centres, nm."""
     return wave * 2 * np.sinh(LOG_STEP / 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Bandpass:
-    """A bandpass as means over the cells of the common grid, ready for quadrature."""
+    """A bandpass averaged over the cells of the common grid."""
 
     name: str
     wave: np.ndarray
-    """(n,) nm, centres of cells of the common grid."""
+    """Centres of the cells, shape (n,), nm."""
     throughput: np.ndarray
-    """(n,) effective area over `area`, dimensionless."""
+    """Effective area divided by `area`, shape (n,), dimensionless."""
     area: float
     """Collecting area, cm2."""
     nodes: np.ndarray
-    """(k,) nm: wavelengths at which the PSF is known; between them it is interpolated linearly."""
+    """Wavelengths at which the PSF is computed, shape (k,), nm; it is interpolated linearly between them."""
 
     @property
     def first(self) -> int:
-        """Number of the first cell."""
+        """Index of the first cell on the common grid."""
         return int(round(np.log(self.wave[0]) / LOG_STEP))
 
     @property
     def weights(self) -> np.ndarray:
-        """(n,) cm2 nm: photons per second of a photon density of one per second, cm2 and nm in that cell alone."""
+        """Weights of the cells, shape (n,), cm2 nm.
+
+        The photon rate, 1/s, is the sum of the weights times a photon flux density in 1/s/cm2/nm.
+        """
         return self.throughput * cell_widths(self.wave) * self.area
 
     def node_weights(self) -> np.ndarray:
-        """Return (n, k): the share of each cell's photons that goes to each PSF node; rows sum to one."""
+        """Return the fraction of each cell's photons that is assigned to each PSF node, shape (n, k); rows sum to 1."""
         position = np.interp(self.wave, self.nodes, np.arange(len(self.nodes)))
         return np.clip(1 - np.abs(position[:, None] - np.arange(len(self.nodes))), 0, 1)
 
     def ab_photons(self) -> float:
-        """Return the photons a second of a source of AB magnitude 0 (flat f_nu = 3631 Jy)."""
+        """Return the photon rate, 1/s, of a source of AB magnitude 0 (flat f_nu = 3631 Jy)."""
         return float(ab_photon_density(self.wave) @ self.weights)
 
 
 def ab_photon_density(wave: np.ndarray) -> np.ndarray:
-    """Return the photons /s/cm2/nm of AB magnitude 0: f_nu / (h lambda)."""
+    """Return the photon flux density, 1/s/cm2/nm, of AB magnitude 0 at wavelengths in nm: f_nu / (h lambda)."""
     planck = 6.62607015e-27  # erg s
     return 3.631e-20 / planck / wave
 
 
 def ab_magnitude(flux: ArrayLike) -> np.ndarray:
-    """Return AB magnitudes of flux densities in nJy; NaN where not positive."""
+    """Return the AB magnitudes of flux densities in nJy; NaN where the flux density is not positive."""
     flux = np.asarray(flux, float)
     return np.where(flux > 0, 31.4 - 2.5 * np.log10(np.where(flux > 0, flux, 1.0)), np.nan)
 
 
 @dataclass(frozen=True)
 class SpectrumLibrary:
-    """Spectra by index, on the common grid, as photon densities relative to that at 500 nm rest frame."""
+    """Spectra on the common grid, as photon densities relative to the density at 500 nm in the rest frame."""
 
     names: tuple[str, ...]
+    """Names of the s spectra."""
     wave: np.ndarray
-    """(n,) nm, rest frame, cells of the common grid; beyond either end there is no light."""
+    """Rest-frame wavelengths of the cells of the common grid, shape (n,), nm; spectra are zero outside."""
     photons: np.ndarray
-    """(s, n) photons per nm, 1 at 500 nm."""
+    """Photons per nm, shape (s, n), 1 at 500 nm."""
     limits: np.ndarray
-    """(s, 2) nm: where each spectrum is known."""
+    """Shortest and longest tabulated wavelength of each spectrum, shape (s, 2), nm."""
 
     @property
     def first(self) -> int:
-        """Number of the first cell."""
+        """Index of the first cell on the common grid."""
         return int(round(np.log(self.wave[0]) / LOG_STEP))
 
 
 @dataclass(frozen=True)
 class LibrarySpectra:
-    """Spectra of a table's objects by index into a library; -1 for none."""
+    """Spectra of n objects as indices into a library."""
 
     library: SpectrumLibrary
     index: np.ndarray
-    """(n,)"""
+    """Index of each object's spectrum, shape (n,); -1 for an object without a spectrum."""
 
     def rows(self, chosen: np.ndarray) -> LibrarySpectra:
-        """Return the spectra of some of the objects."""
+        """Return the spectra of the chosen objects."""
         return LibrarySpectra(self.library, self.index[chosen])
 
 
 @dataclass(frozen=True)
 class TophatSpectra:
-    """Top-hat spectra of a table's objects (cosmoDC2).
+    """Top-hat spectra of n objects, as in cosmoDC2.
 
-    Within a bin f_lambda is constant, L_nu times the bin's width in frequency over its width in wavelength, as
-    skyCatalogs has it. Beyond the last bin the last value of L_nu is continued (to low redshift the catalog ends short
-    of F184's red edge); below the first bin there is no light.
+    Within a bin f_lambda is constant: L_nu times the bin's width in frequency over its width in wavelength, the
+    convention of skyCatalogs. Redward of the last bin the last value of L_nu is continued, because at low redshift the
+    bins of the catalog end short of the red edge of F184. Blueward of the first bin the spectrum is zero.
     """
 
     values: np.ndarray
-    """(n, bins) L_nu, any unit; an object without light has zeros."""
+    """L_nu in any unit, shape (n, bins); zeros for an object without light."""
     edges: np.ndarray
-    """(bins + 1,) nm, rest frame."""
+    """Rest-frame edges of the bins, shape (bins + 1,), nm."""
 
     def rows(self, chosen: np.ndarray) -> TophatSpectra:
-        """Return the spectra of some of the objects."""
+        """Return the spectra of the chosen objects."""
         return TophatSpectra(self.values[chosen], self.edges)
 
 
 def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]], grid: np.ndarray) -> SpectrumLibrary:
-    """Resample spectra (wavelength in nm, f_lambda in any unit) to a library.
+    """Resample tabulated spectra to a library.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of the spectra.
+    spectra : list of (array, array)
+        Wavelengths in nm and f_lambda in any unit, for each spectrum.
+    grid : array, nm
+        Cell centres of the common grid, from `log_grid`.
 
     Raises
     ------
@@ -139,9 +151,10 @@ def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]],
     """
     rows = np.empty((len(names), len(grid)))
     for row, name, (wave, flambda) in zip(rows, names, spectra, strict=True):
-        # between samples the photon density is linear, as GalSim has it; templates are coarse enough for it to matter
+        # the photon density is interpolated linearly between samples, as in GalSim: the templates are coarse enough
+        # for the choice to matter
         photons = np.asarray(flambda) * wave
-        # magnorm is through a top-hat of 1 Angstrom, which matters among the lines of cool stars
+        # magnorm refers to a top-hat band 1 Angstrom wide: the width matters among the lines of cool stars
         at_500 = np.interp(MAGNORM_WAVE + np.linspace(-0.05, 0.05, 41), wave, photons).mean()
         if not at_500 > 0:
             raise ValueError(f"spectrum {name} has no light at 500 nm, where magnorm is defined")
@@ -151,14 +164,17 @@ def library_from(names: list[str], spectra: list[tuple[np.ndarray, np.ndarray]],
 
 
 def _cell_means(wave: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return the means over cells of values that are linear between samples and zero beyond: stars have finer lines."""
+    """Return the cell means of a function that is linear between samples and zero outside.
+
+    Point samples would not do: lines in stellar spectra are narrower than a cell.
+    """
     edges = np.concatenate([grid, grid[-1:] * np.exp(LOG_STEP)]) * np.exp(-LOG_STEP / 2)
     nodes = np.union1d(wave, edges)
-    at = np.interp(nodes, wave, values, left=0.0, right=0.0)
-    total = np.concatenate([[0.0], np.cumsum((at[1:] + at[:-1]) / 2 * np.diff(nodes))])
-    return np.diff(total[np.searchsorted(nodes, edges)]) / np.diff(edges)
+    at_nodes = np.interp(nodes, wave, values, left=0.0, right=0.0)
+    integral = np.concatenate([[0.0], np.cumsum((at_nodes[1:] + at_nodes[:-1]) / 2 * np.diff(nodes))])
+    return np.diff(integral[np.searchsorted(nodes, edges)]) / np.diff(edges)
 
 
 def default_grid() -> np.ndarray:
-    """Return the rest-frame grid of libraries: 60 nm to 2600 nm."""
+    """Return the rest-frame grid of spectrum libraries, 60 nm to 2600 nm."""
     return log_grid(60.0, 2600.0)

@@ -1,7 +1,9 @@
-"""The tile grid: padded images whose unique inner areas cover the sky once; the border rule of every image product.
+"""The tile grid: overlapping images whose inner areas cover the sky exactly once.
 
-Rings of constant declination, each cut at steps of right ascension (Troxel et al. 2023, section 4.4): with h half
-the side of the inner area, dec_j = -90 + (2j + 1) h and ra_i = (2i + 1) h / cos(dec_j).
+An object in the overlap of several images belongs to the tile whose inner area contains it; all image products use
+this rule. The grid consists of rings of constant declination, each divided in right ascension (Troxel et al. 2023,
+section 4.4): the centres are dec_j = -90 + (2j + 1) h and ra_i = (2i + 1) h / cos(dec_j), where h is half the side of
+the inner area.
 """
 
 from __future__ import annotations
@@ -13,24 +15,27 @@ import numpy as np
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, from_tangent_plane
 
-MOST_TILES = 3_000_000
-"""Tiles of a region: of the paper's size as many as cover the whole sky."""
-_RING = 1 << 32
+MAX_TILES = 3_000_000
+"""Largest number of tiles of a region; this many tiles of the paper's size cover the whole sky."""
+_RING_STRIDE = 1 << 32
+"""A tile id is the ring number times this, plus the column number."""
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One tile: a gnomonic image about its centre, north up, east left."""
+    """One tile: a gnomonic image around its centre, north up, east left."""
 
     id: int
+    """Ring number times 2^32, plus the column number in the ring."""
     name: str
+    """Right ascension and declination of the centre as text."""
     ra: float
-    """Centre, degrees."""
+    """Right ascension of the centre, degrees."""
     dec: float
-    """Centre, degrees."""
+    """Declination of the centre, degrees."""
 
     def corners(self, side: float) -> np.ndarray:
-        """Return the four corners (4, 2), degrees, of the image `side` arcsec wide."""
+        """Return the corners, shape (4, 2), degrees, of a square image around the centre that is `side` arcsec wide."""
         half = side / 7200
         return np.stack(
             from_tangent_plane(
@@ -40,12 +45,22 @@ class Tile:
         )
 
     def header(self, pixels: int, scale: float) -> dict[str, float | str]:
-        """Return the FITS TAN header of the image: `pixels` a side, `scale` arcsec a pixel."""
+        """Return the FITS TAN header of an image with `pixels` pixels a side, each `scale` arcsec wide."""
         return tangent_header(self.ra, self.dec, pixels, scale)
 
 
 def tangent_header(ra: float, dec: float, pixels: int, scale: float) -> dict[str, float | str]:
-    """Return the header of a square gnomonic image centred on a position (degrees), north up, east left."""
+    """Return the FITS TAN header of a square image, north up, east left.
+
+    Parameters
+    ----------
+    ra, dec : float, degrees
+        Position of the image centre.
+    pixels : int
+        Side of the image, pixels.
+    scale : float, arcsec
+        Pixel scale.
+    """
     return {
         "CTYPE1": "RA---TAN",
         "CTYPE2": "DEC--TAN",
@@ -65,12 +80,12 @@ def tangent_header(ra: float, dec: float, pixels: int, scale: float) -> dict[str
 
 @dataclass(frozen=True)
 class TileGrid:
-    """All tiles of one survey: image side and overlap are common to all instruments, in arcsec."""
+    """The tile grid of a survey, common to all instruments."""
 
     inner: float
-    """Side of the unique area, arcsec."""
+    """Side of the inner area, arcsec."""
     overlap: float
-    """Padding on every edge, arcsec."""
+    """Padding on each edge, arcsec."""
 
     @property
     def side(self) -> float:
@@ -78,36 +93,36 @@ class TileGrid:
         return self.inner + 2 * self.overlap
 
     def pixels(self, scale: float) -> int:
-        """Return the side of the padded image in pixels of `scale` arcsec."""
+        """Return the side of the padded image, in pixels of `scale` arcsec."""
         return int(np.ceil(self.side / scale - 1e-6))
 
     def owner(self, ra, dec) -> np.ndarray:
-        """Return the id of the one tile whose unique area holds each position (degrees)."""
+        """Return the id of the tile whose inner area contains each position (degrees)."""
         step = self.inner / 3600
         ring = np.clip(np.floor((np.asarray(dec, float) + 90) / step), 0, self._rings - 1).astype(np.int64)
         column = np.floor((np.asarray(ra, float) % 360) / self._width(ring)).astype(np.int64)
-        return ring * _RING + np.minimum(column, self._columns(ring) - 1)
+        return ring * _RING_STRIDE + np.minimum(column, self._columns(ring) - 1)
 
     def tile(self, tile_id: int) -> Tile:
-        """Return a tile by its id."""
-        ring, column = divmod(int(tile_id), _RING)
+        """Return the tile with an id."""
+        ring, column = divmod(int(tile_id), _RING_STRIDE)
         dec = -90 + (2 * ring + 1) * self.inner / 7200
         ra = float((column + 0.5) * self._width(ring)) % 360
         return Tile(id=int(tile_id), name=f"{ra:.4f}_{dec:+.4f}", ra=ra, dec=dec)
 
     def covering(self, region: Region) -> list[Tile]:
-        """Return the tiles whose unique areas touch the region, by declination and right ascension.
+        """Return the tiles whose inner areas touch the region, sorted by declination, then right ascension.
 
         Raises
         ------
         UserError
-            Where the padding does not reach the edges of the unique area (too close to a pole), or tiles would be
-            more than MOST_TILES.
+            If the padded image does not cover the whole inner area because the region is too close to a pole, or if
+            there are more than MAX_TILES tiles.
         """
         count = region.area * 3600 / self.inner**2
-        if count > MOST_TILES:
+        if count > MAX_TILES:
             raise UserError(
-                f"region has {count:.3g} tiles {self.inner:.3g} arcsec wide, at most {MOST_TILES} can be planned: "
+                f"region has {count:.3g} tiles {self.inner:.3g} arcsec wide, at most {MAX_TILES} can be planned: "
                 "raise coadds.pixels or coadds.scale, or make the region smaller"
             )
         step = self.inner / 3600
@@ -117,31 +132,39 @@ class TileGrid:
         for ring in range(max(first, 0), last):
             self._check_ring(ring)
             width, columns = self._width(ring), int(self._columns(ring))
-            # columns count from RA 0 and the last may be cut short there: a region across it is two
-            found: set[int] = set()
+            # columns are counted from RA 0, and the last column of a ring may be narrower: a region that crosses RA 0
+            # is treated as two
+            touched: set[int] = set()
             for low, high in _without_wrap(region):
                 lowest, highest = int(np.floor(low / width + 1e-9)), int(np.ceil(high / width - 1e-9))
-                found |= set(range(lowest, min(highest, columns)))
-            tiles += [self.tile(ring * _RING + column) for column in sorted(found)]
+                touched |= set(range(lowest, min(highest, columns)))
+            tiles += [self.tile(ring * _RING_STRIDE + column) for column in sorted(touched)]
         return tiles
 
     @property
     def _rings(self) -> int:
+        """Number of rings from pole to pole."""
         return int(np.ceil(180 * 3600 / self.inner - 1e-9))
 
     def _width(self, ring) -> np.ndarray:
+        """Return the width in right ascension, degrees, of the inner areas of a ring."""
         centre = np.radians(-90 + (2 * np.asarray(ring) + 1) * self.inner / 7200)
         return self.inner / 3600 / np.maximum(np.cos(centre), 1e-6)
 
     def _columns(self, ring) -> np.ndarray:
+        """Return the number of tiles in a ring."""
         return np.maximum(np.ceil(360 / self._width(ring) - 1e-9), 1).astype(np.int64)
 
     def _check_ring(self, ring: int) -> None:
-        """The box in RA and Dec is wider towards the equator than the tile: the padding must make up for it."""
+        """Raise UserError if the inner areas of a ring reach beyond the padded images.
+
+        The inner area is a box in right ascension and declination, so towards the equator it is wider than the side
+        of the tile. The padding must cover the difference.
+        """
         edge = min(abs(-90 + 2 * (ring + k) * self.inner / 7200) for k in (0, 1))
         centre = abs(-90 + (2 * ring + 1) * self.inner / 7200)
         excess = self.inner / 2 * (np.cos(np.radians(edge)) / max(np.cos(np.radians(centre)), 1e-9) - 1)
-        # a meridian also bends away from the tile's edge; both are second order and largest at the corners
+        # a meridian also curves away from the image's edge; both effects are of second order, largest at the corners
         bend = self.inner / 2 * np.radians(self.inner / 7200) * np.tan(np.radians(min(edge, 89.999)))
         if excess + bend > self.overlap:
             raise UserError(
@@ -152,7 +175,7 @@ class TileGrid:
 
 
 def _without_wrap(region: Region) -> list[tuple[float, float]]:
-    """Return the ranges of right ascension of a region, none across 360."""
+    """Return the ranges of right ascension of a region, degrees, split where it crosses 360."""
     low = region.ra_min % 360
     high = low + region.width
     return [(low, high)] if high <= 360 else [(low, 360.0), (0.0, high - 360)]

@@ -8,7 +8,7 @@ import numpy as np
 
 from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument
-from romandask.kernels.rendering.psf import fine_image
+from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.products.images import ImageProduct
 from romandask.products.units import LazyUnits, Unit
 from romandask.stages.exposures.exposures import Exposures, flat_shares

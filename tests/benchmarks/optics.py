@@ -11,7 +11,8 @@ import galsim.roman
 import numpy as np
 
 from romandask.instruments.roman.optics import FOLDS, MIDDLE, optics, pupil, transforms
-from romandask.kernels.rendering.psf import Grid, place_grid, sample, star_image
+from romandask.kernels.rendering.galsim_sampling import sample
+from romandask.kernels.rendering.psf import Grid, place_grid, star_image
 from romandask.kernels.universe.bandpasses import roman_bandpass
 
 SIDE = (galsim.roman.n_pix, galsim.roman.n_pix)

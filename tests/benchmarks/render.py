@@ -132,7 +132,7 @@ def main() -> None:
     roman = Roman(RomanSettings(bands=(BAND,)))
     source = full_density(roman)
     view = source.view(0)
-    source.expected(view)  # compiles
+    view.expected()  # compiles
     scene_time, view = seconds(lambda: source.view(0))
     psf = roman.psf(view.exposure)
     # of the same SCA and band again: the PSF is made once

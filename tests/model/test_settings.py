@@ -1,3 +1,5 @@
+"""Pipeline files, overrides, and the errors for wrong settings."""
+
 import pytest
 import yaml
 from hypothesis import given
@@ -8,14 +10,14 @@ from romandask.model.settings import apply_overrides
 from romandask.pipeline import load_pipeline, pipeline_of, shipped
 
 
-def test_every_shipped_pipeline_is_valid_and_survives_its_own_yaml():
+def test_shipped_pipelines_are_valid_and_survive_a_round_trip_through_yaml():
     assert {"tiny", "dc2_sample"} <= set(shipped())
     for name in shipped():
         settings = load_pipeline(name)
         assert pipeline_of(yaml.safe_load(settings.to_yaml()), name) == settings
 
 
-def test_overrides_reach_nested_keys():
+def test_overrides_set_nested_keys():
     settings = load_pipeline("tiny", ["coadds.pixfrac=0.8", "rubin.bands=[g, i]", "seed=3"])
     assert settings.coadds.pixfrac == 0.8
     assert settings.rubin.bands == ("g", "i")
@@ -39,7 +41,7 @@ def test_overrides_reach_nested_keys():
         ("seed=[1", ["not a valid value"]),
     ],
 )
-def test_a_wrong_setting_is_one_error_that_names_it(override, words):
+def test_a_wrong_setting_gives_a_one_line_error_that_names_it(override, words):
     with pytest.raises(UserError) as caught:
         load_pipeline("tiny", [override])
     for word in words:
@@ -47,12 +49,12 @@ def test_a_wrong_setting_is_one_error_that_names_it(override, words):
     assert "\n" not in str(caught.value)
 
 
-def test_all_wrong_keys_are_named_at_once():
+def test_one_error_names_all_wrong_keys():
     with pytest.raises(UserError, match=r"sead.*seed.*regoin|regoin.*sead"):
         load_pipeline("tiny", ["sead=1", "regoin=2"])
 
 
-def test_files_that_are_not_pipelines(tmp_path):
+def test_files_that_are_not_pipelines_are_rejected(tmp_path):
     (tmp_path / "list.yaml").write_text("- a\n- b\n")
     (tmp_path / "broken.yaml").write_text("a: [1\nb: 2")
     (tmp_path / "code.yaml").write_text("!!python/object/apply:os.system [echo]")
@@ -67,7 +69,7 @@ def test_files_that_are_not_pipelines(tmp_path):
 
 
 @given(st.text(max_size=30))
-def test_any_override_text_is_applied_or_refused_clearly(text):
+def test_any_override_text_is_applied_or_raises_user_error(text):
     try:
         apply_overrides({"a": {"b": 1}}, [text])
     except UserError:

@@ -1,3 +1,5 @@
+"""Spherical polygons, unit vectors and regions."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,13 +9,13 @@ from romandask.model.sky import Region, cell_of, from_tangent_plane, radec, touc
 
 
 def square(ra: float, dec: float, half: float, angle: float) -> np.ndarray:
-    """Corners of a square of half side `half` degrees, turned by `angle` degrees."""
+    """Return the corners of a square with sides of 2 `half` degrees, rotated by `angle` degrees."""
     turn = np.radians(angle + np.array([45, 135, 225, 315]))
     return np.stack(from_tangent_plane(ra, dec, half * np.sqrt(2) * np.cos(turn), half * np.sqrt(2) * np.sin(turn)), 1)
 
 
 def overlap_by_points(a: np.ndarray, b: np.ndarray) -> bool:
-    """True where a fine grid of points of one square lies in the other, in the gnomonic plane about the first."""
+    """Return True if any point of a fine grid over one square lies inside the other, either way."""
     steps = np.linspace(0, 1, 41)
     u, v = np.meshgrid(steps, steps)
 
@@ -40,7 +42,7 @@ def overlap_by_points(a: np.ndarray, b: np.ndarray) -> bool:
     angle=st.floats(0, 90),
     half=st.floats(0.05, 0.3),
 )
-def test_touching_squares_are_found_anywhere_on_the_sphere(ra, dec, east, north, angle, half):
+def test_touching_pairs_finds_overlapping_squares_anywhere_on_the_sphere(ra, dec, east, north, angle, half):
     first = square(ra, dec, 0.1, 0)
     other_ra, other_dec = from_tangent_plane(ra, dec, east, north)
     second = square(float(other_ra), float(other_dec), half, angle)
@@ -52,7 +54,7 @@ def test_touching_squares_are_found_anywhere_on_the_sphere(ra, dec, east, north,
         assert not found
 
 
-def test_pairs_do_not_change_when_the_sky_turns():
+def test_touching_pairs_are_invariant_under_rotation_in_right_ascension():
     random = np.random.default_rng(3)
     a = np.stack(
         [
@@ -66,19 +68,19 @@ def test_pairs_do_not_change_when_the_sky_turns():
         [square(r, d, 0.3, 10) for r, d in zip(random.uniform(-180, 180, 40), random.uniform(88, 90, 40), strict=True)]
     )
     pairs = np.stack(touching_pairs(a, b))
-    turn = np.array([123.4, 0.0])
-    np.testing.assert_array_equal(pairs, np.stack(touching_pairs(a + turn, b + turn)))
+    rotation = np.array([123.4, 0.0])
+    np.testing.assert_array_equal(pairs, np.stack(touching_pairs(a + rotation, b + rotation)))
     assert pairs.shape[1] > 10
 
 
-def test_unit_vectors_and_back():
+def test_radec_inverts_unit_vectors():
     ra, dec = radec(unit_vectors([0.0, 359.9, 12.0], [-89.0, 0.0, 45.0]))
     np.testing.assert_allclose(ra, [0.0, 359.9, 12.0], atol=1e-12)
     np.testing.assert_allclose(dec, [-89.0, 0.0, 45.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("low", "high"), [(51.0, 56.0), (359.9, 0.2), (0.0, 360.0)])
-def test_region_cells_hold_every_point_of_the_region(low, high):
+def test_region_cells_contain_every_position_of_the_region(low, high):
     region = Region(low, high, -42.0, -38.0)
     random = np.random.default_rng(1)
     ra = (low + random.uniform(0, region.width, 5000)) % 360
@@ -87,11 +89,11 @@ def test_region_cells_hold_every_point_of_the_region(low, high):
     assert set(cell_of(ra, dec, 6)) <= set(region.cells(6))
 
 
-def test_region_area_is_the_solid_angle():
+def test_region_area_is_its_solid_angle():
     assert Region(51, 56, -42, -38).area / 3600 == pytest.approx(15.3, abs=0.05)
 
 
-def test_regions_that_meet_share_no_point():
+def test_adjacent_regions_share_no_position():
     left, right = Region(10, 11, 0, 1), Region(11, 12, 0, 1)
     ra = np.array([10.0, 10.999999999, 11.0, 11.5])
     assert (left.contains(ra, ra * 0 + 0.5).astype(int) + right.contains(ra, ra * 0 + 0.5) == 1).all()

@@ -1,3 +1,5 @@
+"""The tile grid."""
+
 import numpy as np
 import pytest
 from astropy.wcs import WCS
@@ -9,11 +11,12 @@ from romandask.model.tiles import TileGrid
 
 
 def random_sky(count: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return random right ascensions, and declinations between two limits, degrees."""
     random = np.random.default_rng(2)
     return random.uniform(0, 360, count), random.uniform(low, high, count)
 
 
-def test_the_paper_grid_has_its_half_tile_and_its_number_of_tiles():
+def test_default_grid_has_the_size_and_number_of_tiles_of_the_paper():
     grid = CoaddSettings().grid()
     assert grid.inner / 7200 == pytest.approx(0.0575 * 7825 / 7200)
     assert grid.pixels(0.0575) == 8825
@@ -21,7 +24,7 @@ def test_the_paper_grid_has_its_half_tile_and_its_number_of_tiles():
 
 
 @pytest.mark.parametrize("inner", [46.0, 450.0])
-def test_every_position_lies_in_the_padded_image_of_the_one_tile_that_owns_it(inner):
+def test_every_position_is_on_the_padded_image_of_its_owner(inner):
     grid = TileGrid(inner, 30.0)
     ra, dec = random_sky(400, -80, 80)
     ra[:50] = np.r_[np.linspace(359.9, 360, 25), np.linspace(0, 0.1, 25)]
@@ -34,7 +37,7 @@ def test_every_position_lies_in_the_padded_image_of_the_one_tile_that_owns_it(in
 
 
 @pytest.mark.parametrize("ra", [(10.0, 10.3), (359.9, 0.15)])
-def test_covering_tiles_own_the_whole_region_and_are_distinct(ra):
+def test_covering_tiles_own_every_position_of_the_region_and_have_unique_names(ra):
     region, grid = Region(*ra, -40.2, -40.0), TileGrid(100.0, 20.0)
     tiles = grid.covering(region)
     names = [tile.name for tile in tiles]
@@ -44,7 +47,7 @@ def test_covering_tiles_own_the_whole_region_and_are_distinct(ra):
     assert set(grid.owner(*points)) <= {tile.id for tile in tiles}
 
 
-def test_corners_are_those_of_the_image():
+def test_corners_agree_with_the_wcs_of_the_image():
     grid = TileGrid(100.0, 20.0)
     tile = grid.tile(grid.owner(12.3, -45.6))
     pixels = grid.pixels(0.2)
@@ -53,6 +56,6 @@ def test_corners_are_those_of_the_image():
     np.testing.assert_allclose(unit_vectors(*corners), expected, atol=1e-10)
 
 
-def test_a_region_too_near_the_pole_is_refused_with_the_remedy():
+def test_a_region_too_close_to_the_pole_is_an_error_that_names_the_setting_to_change():
     with pytest.raises(UserError, match=r"coadds\.overlap"):
         CoaddSettings().grid().covering(Region(0, 10, 89.0, 89.5))

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from astropy.wcs import WCS
 
-from romandask.kernels.rendering.scene import BAD_FLUX, BAD_LENSING, BAD_SIZE, NO_PLACE
+from romandask.kernels.rendering.scene import BAD_FLUX, BAD_LENSING, BAD_SIZE, NO_POSITION
 from romandask.stages.exposures.render import RenderExposure
 from romandask.stages.truth_index import truth_index
 
@@ -58,8 +58,8 @@ def test_what_cannot_be_drawn_has_its_reason_and_no_pixel(small, index):
         "shear_1": (np.nan, BAD_LENSING),
         "disk_magnorm": (-60.0, BAD_FLUX),
         # behind the projection, and at its pole
-        "ra": (233.0, NO_PLACE),
-        "dec": (90.0, NO_PLACE),
+        "ra": (233.0, NO_POSITION),
+        "dec": (90.0, NO_POSITION),
     }
     inside = index.query("kind == 'galaxy' and 40 < x < 260 and 40 < y < 260")
     ids = inside.nlargest(len(wrong), "flux")["id"].to_numpy()
@@ -73,13 +73,13 @@ def test_what_cannot_be_drawn_has_its_reason_and_no_pixel(small, index):
             return replace(truth, galaxies=galaxies)
 
     spoiled = replace(source, truth=Spoiled())
-    found = truth_index(replace(small.product, make=spoiled)).load(0).set_index("id")
+    found = truth_index(replace(small.product, renderer=spoiled)).load(0).set_index("id")
     assert found.loc[ids, "reason"].tolist() == [reason for _, reason in wrong.values()]
     assert not found.loc[ids, "drawn"].any()
     assert (found.loc[ids, "flux"] == 0).all()
     assert found.loc[ids, "mag"].isna().all()
-    image = spoiled.expected(spoiled.view(0))
+    image = spoiled.view(0).expected()
     assert np.isfinite(image).all()
-    whole = source.expected(source.view(0))
+    whole = source.view(0).expected()
     lost = index.set_index("id").loc[ids, "flux"].sum()
     assert whole.sum() - image.sum() == pytest.approx(lost, rel=0.05)

@@ -27,7 +27,7 @@ from romandask.kernels.detectors.ccd import (
 from romandask.kernels.detectors.cosmic_rays import hits, tracks
 from romandask.kernels.detectors.poisson import poisson
 from romandask.kernels.detectors.simple_detector import SATURATED
-from romandask.kernels.rendering.silicon import LEAST, through_silicon
+from romandask.kernels.rendering.silicon import MIN_ELECTRONS, through_silicon
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
@@ -68,7 +68,7 @@ class CcdReadout:
     def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
         """Return raw, image, truth, variance and dq of an exposure, bright objects through the silicon if asked for."""
         exposure, scene, sizes = light.exposure, light.scene, light.stamp_sizes
-        bright = (scene.fluxes() >= LEAST) & (sizes > 0)
+        bright = (scene.fluxes() >= MIN_ELECTRONS) & (sizes > 0)
         if self.sensor == "ideal" or not bright.any():
             expected = light.expected()
             return {**self.read(exposure, expected, light.background, None), "truth": expected}

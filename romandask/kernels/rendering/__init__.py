@@ -1,1 +1,1 @@
-"""Drawing galaxies and stars in Fourier space, and GalSim as the reference."""
+"""Rendering of galaxies and stars in Fourier space, and with GalSim as the reference."""

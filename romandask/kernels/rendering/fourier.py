@@ -1,10 +1,11 @@
-"""Compiled sums of the renderer: transforms of objects at the frequencies of their stamps, folded to the pixel grid.
+"""Compiled functions of the Fourier renderer: transforms of objects at the frequencies of their stamps.
 
-The frequencies of a stamp that the PSF reaches lie one after another in flat arrays, row by row, so that the loops
-over them are vectorised: amplitudes of the PSF's modes, then the profile's transform, then phases and folding.
+The frequencies of a stamp at which the PSF has power are stored in flat arrays, row by row, so that the compiler can
+vectorise the loops over them. A transform is the sum over components of the PSF times the transform of the profile; it
+is then multiplied by the phases of the position and folded to the frequencies of the pixel grid.
 
-Nothing here is compiled with fastmath: a loop has a vectorised and a plain form, of which the places of its arrays in
-memory choose one, and with fused operations the two differ in the last bit, so that pixels would with the memory.
+fastmath is not used. A compiled loop has a vectorised and a scalar form, and the alignment of its arrays decides which
+one runs. With fused operations the two forms differ in the last bit, so pixel values would depend on memory addresses.
 """
 
 from __future__ import annotations
@@ -17,23 +18,17 @@ import numba
 import numpy as np
 
 POINT, EXPONENTIAL, DEVAUCOULEURS, KNOTS = 0, 1, 2, 3
+"""Kinds of components."""
 EXPONENTIAL_RADIUS = 1 / 1.6783469900166605
-"""Scale length of an exponential disk over its half-light radius."""
+"""Scale length of an exponential disk, in units of its half-light radius."""
 KNOT_SIGMA = 1 / np.sqrt(2 * np.log(2))
-"""Gaussian sigma over half-light radius."""
-_DISK = np.float32(EXPONENTIAL_RADIUS**2)
-_DECAY = 1.6783469900166605
-"""Of an exponential disk: exp(-1.678 r) at r half-light radii."""
-_WINGS = 7.669249442500805
-"""Of a de Vaucouleurs profile: exp(-7.669 r^(1/4))."""
-_PEAK = 5040 * 4 * 2 * np.pi / _WINGS**8
-"""Light of a de Vaucouleurs profile that is 1 in its centre, half-light radius 1: 8 pi Gamma(8) / b^8."""
-_FAR_DISK, _FAR_BULGE = 6.5, 70.0
-"""Half-light radii beyond which less than 2e-4 of the light lies."""
-_KNOTS_A_SIDE = 9
-_LEAST = np.float32(2.0**-20)
+"""Sigma of a round Gaussian, in units of its half-light radius."""
+_EXPONENTIAL_RADIUS_SQUARED = np.float32(EXPONENTIAL_RADIUS**2)
+_MIN_SQUARE = np.float32(2.0**-20)
+"""Smallest k^2 in the de Vaucouleurs table."""
 _CELL_BITS, _OCTAVES = 7, 52
-"""The de Vaucouleurs table has 128 cells in each octave of k^2, found from the bits of a float32, from 2^-20 on."""
+"""The de Vaucouleurs table has 128 cells in each octave of k^2, from 2^-20 on. The cell of a float32 is read from its
+bits."""
 _SHIFT = 23 - _CELL_BITS
 _FIRST_CELL = (127 - 20) << _CELL_BITS
 _CELLS = _OCTAVES << _CELL_BITS
@@ -41,47 +36,56 @@ _CELLS = _OCTAVES << _CELL_BITS
 
 @dataclass(frozen=True)
 class Frequencies:
-    """Where a PSF has power, among the frequencies of one stamp size (column >= 0)."""
+    """The modes of a PSF at the frequencies of one stamp size at which the PSF has power.
+
+    Frequencies are 2 pi (j_x, j_y) / size, with rows j_y = -reach, ..., reach - 1 and columns j_x = 0, 1, ... of each
+    row, one row after the other in flat arrays.
+    """
 
     starts: np.ndarray
-    """(rows + 1,) where each row begins in the flat arrays; rows are j_y = -reach ..., columns j_x = 0 ..."""
+    """Index of the first frequency of each row in the flat arrays, shape (rows + 1,)."""
     x: np.ndarray
-    """(points,) float32, radians a pixel."""
+    """Frequencies along x, shape (points,), float32, radians per pixel."""
     y: np.ndarray
-    """(points,) float32"""
+    """Frequencies along y, shape (points,), float32, radians per pixel."""
     real: np.ndarray
-    """(modes, points) float32: the PSF's modes."""
+    """Real part of the modes, shape (modes, points), float32."""
     imaginary: np.ndarray
-    """(modes, points) float32"""
+    """Imaginary part of the modes, shape (modes, points), float32."""
 
     @property
     def totals(self) -> np.ndarray:
-        """(modes,) their values at zero frequency: the light on the stamp."""
+        """Values of the modes at zero frequency, that is their light on the stamp, shape (modes,)."""
         return self.real[:, self.starts[(len(self.starts) - 1) // 2]]
 
 
-def frequencies(transforms: np.ndarray, seen: np.ndarray, stamp: int) -> Frequencies:
-    """Return the frequencies of a stamp of `stamp` pixels at which PSFs have power.
+def pack_frequencies(transforms: np.ndarray, has_power: np.ndarray, stamp: int) -> Frequencies:
+    """Return PSF modes at the frequencies of a stamp at which they have power.
 
     Parameters
     ----------
-    transforms : (modes, rows, columns) complex, rows j_y = -rows / 2 ..., columns j_x = 0 ..., of 2 pi j / stamp
-    seen : (rows, columns) True where there is any power
+    transforms : complex array, shape (modes, rows, columns)
+        Transforms of the modes at frequencies 2 pi j / stamp, with rows j_y = -rows / 2, ... and columns
+        j_x = 0, 1, ...
+    has_power : bool array, shape (rows, columns)
+        True where any mode has power.
+    stamp : int
+        Side of the stamp, pixels.
     """
-    # a row is kept to its last frequency with power; the negative Nyquist row has no partner
-    last = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
-    last[0] = 0
-    starts = np.concatenate([[0], np.cumsum(last)])
+    # each row is kept up to its last frequency with power; the row of the negative Nyquist frequency has no partner
+    counts = np.where(has_power.any(axis=1), has_power.shape[1] - np.argmax(has_power[:, ::-1], axis=1), 0)
+    counts[0] = 0
+    starts = np.concatenate([[0], np.cumsum(counts)])
     shape = (len(transforms), starts[-1])
     x, y = np.empty(starts[-1], np.float32), np.empty(starts[-1], np.float32)
     real, imaginary = np.empty(shape, np.float32), np.empty(shape, np.float32)
     step = 2 * np.pi / stamp
-    columns = (np.arange(seen.shape[1]) * step).astype(np.float32)
-    # row by row, for the largest stamps have tens of millions of frequencies
-    for row, count in enumerate(last):
+    columns = (np.arange(has_power.shape[1]) * step).astype(np.float32)
+    # row by row to save memory: the largest stamps have tens of millions of frequencies
+    for row, count in enumerate(counts):
         part = slice(starts[row], starts[row + 1])
         x[part] = columns[:count]
-        y[part] = (row - len(last) // 2) * step
+        y[part] = (row - len(counts) // 2) * step
         real[:, part] = transforms[:, row, :count].real
         imaginary[:, part] = transforms[:, row, :count].imag
     return Frequencies(starts, x, y, real, imaginary)
@@ -89,7 +93,10 @@ def frequencies(transforms: np.ndarray, seen: np.ndarray, stamp: int) -> Frequen
 
 @lru_cache(maxsize=1)
 def devaucouleurs_table() -> np.ndarray:
-    """Return the transform of a de Vaucouleurs profile, half-light radius 1, at the first k^2 of each cell, float32."""
+    """Return the transform of a de Vaucouleurs profile of flux 1 and half-light radius 1, float32.
+
+    Entry j is the transform at the smallest k^2 of cell j; see _CELL_BITS.
+    """
     profile = galsim.DeVaucouleurs(half_light_radius=1.0)
     cell = np.arange(_CELLS + 1)
     squares = 2.0 ** (cell // (1 << _CELL_BITS) - 20) * (1 + (cell % (1 << _CELL_BITS)) / (1 << _CELL_BITS))
@@ -98,7 +105,7 @@ def devaucouleurs_table() -> np.ndarray:
 
 @numba.njit(nogil=True, cache=True)
 def _hash(key, counter):
-    """splitmix64 of an identity and a counter, to (0, 1)."""
+    """Return a random number in (0, 1) from an identity and a counter (splitmix64)."""
     value = np.uint64(key) + np.uint64(counter) * np.uint64(0x9E3779B97F4A7C15)
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -108,7 +115,17 @@ def _hash(key, counter):
 
 @numba.njit(nogil=True, cache=True)
 def knot_offset(key, knot):
-    """Return the position of a knot in units of the half-light radius of a round Gaussian: the same in every image."""
+    """Return the position of a knot relative to the centre of its galaxy, the same in every image.
+
+    Positions follow a round Gaussian and are in units of its half-light radius.
+
+    Parameters
+    ----------
+    key : uint64
+        Identity of the galaxy.
+    knot : int
+        Number of the knot.
+    """
     first = _hash(key, 2 * knot + 1)
     second = _hash(key, 2 * knot + 2)
     radius = 0.8493218002880191 * np.sqrt(-2.0 * np.log(first))
@@ -117,7 +134,7 @@ def knot_offset(key, knot):
 
 @numba.njit(nogil=True, cache=True)
 def _phases(angle, lowest, out):
-    """Write exp(-i angle j) for j = lowest, lowest + 1, ..."""
+    """Write exp(-i angle j) for j = lowest, lowest + 1, ... to `out`."""
     turn = np.cos(angle) - 1j * np.sin(angle)
     value = np.cos(angle * lowest) - 1j * np.sin(angle * lowest)
     for j in range(out.shape[0]):
@@ -127,7 +144,7 @@ def _phases(angle, lowest, out):
 
 @numba.njit(nogil=True, cache=True)
 def _squares(matrix, kx, ky, out):
-    """Write |M^T k|^2: the squared frequency in the frame in which the profile is round."""
+    """Write |M^T k|^2, the squared frequency in the frame in which the profile is round, to `out`."""
     xx = np.float32(matrix[0, 0] ** 2 + matrix[0, 1] ** 2)
     yy = np.float32(matrix[1, 0] ** 2 + matrix[1, 1] ** 2)
     xy = np.float32(2 * (matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1]))
@@ -137,8 +154,9 @@ def _squares(matrix, kx, ky, out):
 
 @numba.njit(nogil=True, cache=True)
 def _exponential(squares, re, im, total_re, total_im):
+    """Add the transform of an exponential disk times a PSF (re, im) to the totals."""
     for i in range(squares.shape[0]):
-        t = np.float32(1) + _DISK * squares[i]
+        t = np.float32(1) + _EXPONENTIAL_RADIUS_SQUARED * squares[i]
         value = np.float32(1) / (t * np.sqrt(t))
         total_re[i] += value * re[i]
         total_im[i] += value * im[i]
@@ -146,32 +164,36 @@ def _exponential(squares, re, im, total_re, total_im):
 
 @numba.njit(nogil=True, cache=True)
 def _devaucouleurs(squares, table, re, im, total_re, total_im):
+    """Add the transform of a de Vaucouleurs profile times a PSF (re, im) to the totals; overwrites `squares`."""
     bits = squares.view(np.int32)
-    part = np.float32(1.0 / (1 << _SHIFT))
+    unit = np.float32(1.0 / (1 << _SHIFT))
     for i in range(squares.shape[0]):
-        squares[i] = max(squares[i], _LEAST)
+        squares[i] = max(squares[i], _MIN_SQUARE)
     for i in range(squares.shape[0]):
         cell = min((bits[i] >> _SHIFT) - _FIRST_CELL, _CELLS - 1)
-        share = np.float32(bits[i] & ((1 << _SHIFT) - 1)) * part
-        value = table[cell] + share * (table[cell + 1] - table[cell])
+        fraction = np.float32(bits[i] & ((1 << _SHIFT) - 1)) * unit
+        value = table[cell] + fraction * (table[cell + 1] - table[cell])
         total_re[i] += value * re[i]
         total_im[i] += value * im[i]
 
 
 @numba.njit(nogil=True, cache=True)
-def _within(xx, xy, yy, y, step):
-    """Return how many frequencies 0, step, ... of a row at `y` a Gaussian leaves above 6e-6."""
+def _gaussian_count(xx, xy, yy, y, step):
+    """Return the number of frequencies 0, step, ... of the row at `y` up to which a Gaussian is above 6e-6."""
     if xx <= 0:
         return 1 << 30
-    square = xy * xy * y * y - xx * (yy * y * y - 24.0)
-    if square < 0:
+    discriminant = xy * xy * y * y - xx * (yy * y * y - 24.0)
+    if discriminant < 0:
         return 0
-    return max(0, int((np.sqrt(square) - xy * y) / (xx * step)) + 1)
+    return max(0, int((np.sqrt(discriminant) - xy * y) / (xx * step)) + 1)
 
 
 @numba.njit(nogil=True, cache=True)
 def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, total_re, total_im):
-    """Add points at the places that an identity gives, each smoothed by a Gaussian, of equal light."""
+    """Add the transform of knots times a PSF (re, im) to the totals.
+
+    Knots are points of equal flux at the positions of `knot_offset`, each smoothed by a Gaussian.
+    """
     xx = smoothing[0, 0] ** 2 + smoothing[0, 1] ** 2
     yy = smoothing[1, 0] ** 2 + smoothing[1, 1] ** 2
     xy = smoothing[0, 0] * smoothing[1, 0] + smoothing[0, 1] * smoothing[1, 1]
@@ -186,7 +208,7 @@ def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, t
     sum_re, sum_im = np.empty(reach + 1, np.float32), np.empty(reach + 1, np.float32)
     for j in range(2 * reach):
         first, n = starts[j], starts[j + 1] - starts[j]
-        n = min(n, _within(xx, xy, yy, step * (j - reach), step))
+        n = min(n, _gaussian_count(xx, xy, yy, step * (j - reach), step))
         sum_re[:n] = 0
         sum_im[:n] = 0
         for k in range(count):
@@ -204,7 +226,10 @@ def _knots(key, count, matrix, smoothing, starts, kx, ky, step, reach, re, im, t
 
 @numba.njit(nogil=True, cache=True)
 def _fold(total_re, total_im, starts, columns, rows, reach, real, imaginary):
-    """Add phases and fold frequencies to those of the pixel grid: (size, size / 2 + 1), zeros at first."""
+    """Multiply a transform by the phases of a position, and fold it to the frequencies of the pixel grid.
+
+    The result is added to `real` and `imaginary`, shape (size, size / 2 + 1).
+    """
     size = real.shape[0]
     half = size // 2
     across_re = np.ascontiguousarray(columns.real).astype(np.float32)
@@ -216,7 +241,8 @@ def _fold(total_re, total_im, starts, columns, rows, reach, real, imaginary):
         a, b = np.float32(rows[j].real), np.float32(rows[j].imag)
         for low in range(0, n, half):
             count = min(half + 1, n - low)
-            # of each half of a period the one is copied, the other is its mirror image; their ends belong to both
+            # even half periods are added as they are, odd ones mirrored and complex-conjugated; the frequency between
+            # two half periods belongs to both
             if (low // half) % 2 == 0:
                 for i in range(count):
                     p, q = across_re[low + i], across_im[low + i]
@@ -234,15 +260,33 @@ def _fold(total_re, total_im, starts, columns, rows, reach, real, imaginary):
 
 
 @numba.njit(nogil=True, cache=True)
-def fill(out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, begin, real, imaginary, starts, kx, ky, table):
-    """Write the folded transforms of objects to `out` (stamps, size, size / 2 + 1); they begin at floor(x) - size / 2.
+def fill_transforms(
+    out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, begin, real, imaginary, starts, kx, ky, table
+):
+    """Write the transforms of objects on stamps, folded to the frequencies of the pixel grid.
+
+    The first pixel of a stamp is the pixel floor(x) - size / 2, floor(y) - size / 2 of the image.
 
     Parameters
     ----------
-    chosen : (stamps,) numbers of the objects
-    first : (objects + 1,) number of the first component of each
-    begin : (stamps,) row of the PSF of the first component of each
-    real, imaginary : (components of these objects, points) float32: the PSF of each, times its light
+    out : complex64 array, shape (stamps, size, size / 2 + 1)
+        Output.
+    chosen : int array, shape (stamps,)
+        Indices of the objects.
+    x, y, keys : array, shape (objects,)
+        Fields of `Scene`.
+    first : int array, shape (objects + 1,)
+        Index of the first component of each object.
+    kind, matrix, smoothing, knots : array, shape (components, ...)
+        Fields of `Scene`.
+    begin : int array, shape (stamps,)
+        Row in `real` and `imaginary` of the first component of each chosen object.
+    real, imaginary : float32 array, shape (components of the chosen objects, points)
+        PSF of each component times its flux.
+    starts, kx, ky : array
+        Fields `starts`, `x` and `y` of `Frequencies`.
+    table : float32 array
+        Result of `devaucouleurs_table`.
     """
     size = out.shape[1]
     step = 2 * np.pi / size
@@ -280,92 +324,3 @@ def fill(out, chosen, x, y, keys, first, kind, matrix, smoothing, knots, begin, 
         for j in range(size):
             for i in range(size // 2 + 1):
                 out[s, j, i] = np.complex64(folded_re[j, i] + 1j * folded_im[j, i])
-
-
-@numba.njit(nogil=True, cache=True)
-def _wing(kind, xx, xy, yy, dx, dy):
-    """Return a profile of light 1, |det M| = 1, at an offset of its centre; M M^T inverted is [[xx, xy], [xy, yy]]."""
-    radius = np.sqrt(max(xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy, 0.0))
-    if kind == EXPONENTIAL:
-        return _DECAY * _DECAY / (2 * np.pi) * np.exp(-_DECAY * radius)
-    return np.exp(-_WINGS * np.sqrt(np.sqrt(radius))) / _PEAK
-
-
-@numba.njit(nogil=True, cache=True)
-def unfold(stamps, chosen, x, y, first, kind, matrix, light):
-    """Subtract from stamps (n, size, size) the light of galaxies from beyond their edges.
-
-    A transform sampled at a stamp's frequencies is that of a profile repeated with the stamp's period. The light of the
-    repetitions is smooth there, far in their wings: it is found on a coarse grid and interpolated linearly.
-
-    Parameters
-    ----------
-    light : (components,) as their PSF has it on the stamp
-    """
-    size = stamps.shape[1]
-    n = _KNOTS_A_SIDE
-    step = (size - 1) / (n - 1)
-    coarse = np.empty((n, n))
-    for s in range(chosen.shape[0]):
-        o = chosen[s]
-        x0, y0 = x[o] - np.floor(x[o]) + size // 2, y[o] - np.floor(y[o]) + size // 2
-        coarse[:] = 0
-        any_light = False
-        for c in range(first[o], first[o + 1]):
-            if kind[c] != EXPONENTIAL and kind[c] != DEVAUCOULEURS:
-                continue
-            m = matrix[c]
-            xx, yy = m[0, 0] ** 2 + m[0, 1] ** 2, m[1, 0] ** 2 + m[1, 1] ** 2
-            xy = m[0, 0] * m[1, 0] + m[0, 1] * m[1, 1]
-            area = np.sqrt(max(xx * yy - xy * xy, 1e-30))
-            largest = np.sqrt((xx + yy + np.sqrt((xx - yy) ** 2 + 4 * xy * xy)) / 2)
-            far = _FAR_DISK if kind[c] == EXPONENTIAL else _FAR_BULGE
-            if size / 2 > far * largest or light[c] == 0:
-                continue
-            any_light = True
-            ixx, ixy, iyy = yy / area**2, -xy / area**2, xx / area**2
-            scale = light[c] / area
-            outer = 0.0
-            for j in range(-2, 3):
-                for i in range(-2, 3):
-                    if abs(i) == 2 or abs(j) == 2:
-                        outer += _wing(kind[c], ixx, ixy, iyy, i * size, j * size)
-            for b in range(n):
-                for a in range(n):
-                    total = outer
-                    for j in range(-1, 2):
-                        for i in range(-1, 2):
-                            if i != 0 or j != 0:
-                                dx, dy = a * step - x0 + i * size, b * step - y0 + j * size
-                                total += _wing(kind[c], ixx, ixy, iyy, dx, dy)
-                    coarse[b, a] += scale * total
-        if any_light:
-            _subtract(stamps[s], coarse, step)
-
-
-@numba.njit(nogil=True, cache=True)
-def _subtract(stamp, coarse, step):
-    """Subtract what a coarse grid with a step has between its points, linearly."""
-    size, n = stamp.shape[0], coarse.shape[0]
-    for j in range(size):
-        b = min(int(j / step), n - 2)
-        up = j / step - b
-        for i in range(size):
-            a = min(int(i / step), n - 2)
-            across = i / step - a
-            low = coarse[b, a] + across * (coarse[b, a + 1] - coarse[b, a])
-            high = coarse[b + 1, a] + across * (coarse[b + 1, a + 1] - coarse[b + 1, a])
-            stamp[j, i] -= low + up * (high - low)
-
-
-@numba.njit(nogil=True, cache=True)
-def add(image, stamps, chosen, x, y):
-    """Add stamps (n, size, size) of objects to the image where they fall on it."""
-    ny, nx = image.shape
-    size = stamps.shape[1]
-    for s in range(chosen.shape[0]):
-        x0 = int(np.floor(x[chosen[s]])) - size // 2
-        y0 = int(np.floor(y[chosen[s]])) - size // 2
-        for j in range(max(0, -y0), min(size, ny - y0)):
-            for i in range(max(0, -x0), min(size, nx - x0)):
-                image[y0 + j, x0 + i] += stamps[s, j, i]

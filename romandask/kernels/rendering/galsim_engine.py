@@ -1,4 +1,4 @@
-"""The second renderer: GalSim draws object by object, by FFT; slow, independent of the first, and its oracle."""
+"""Reference renderer: GalSim draws one object at a time by FFT; slow, but independent of the Fourier renderer."""
 
 from __future__ import annotations
 
@@ -10,32 +10,45 @@ import numpy as np
 from romandask.kernels.rendering.draw import Scene, Stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, knot_offset
 
-Place = tuple[int, int]
-LEAST_SHARE = 1e-9
-"""A component with a smaller share of an object's light is not drawn."""
+Cell = tuple[int, int]
+"""Column and row of a cell of the detector; all objects in a cell are drawn with the same PSFs."""
+MIN_FLUX_FRACTION = 1e-9
+"""Components with a smaller fraction of the flux of an object are not drawn."""
 
 
 def draw_objects(
     scene: Scene,
-    psfs: Callable[[float, float], tuple[Place, list[galsim.GSObject]]],
+    psfs: Callable[[float, float], tuple[Cell, list[galsim.GSObject]]],
     shape: tuple[int, int],
     stamps: Stamps,
     pixel_scale: float,
 ) -> np.ndarray:
-    """Return the image (float32, electrons) of a scene.
+    """Return the image of a scene.
 
     Parameters
     ----------
-    psfs : gives for a pixel position the place whose PSFs are used there, and these PSFs (arcsec), one a node
-    shape : (ny, nx)
-    stamps : sizes of the stamps; those of objects that are not drawn are 0
-    pixel_scale : arcsec
+    scene : Scene
+        Objects.
+    psfs : callable
+        Function of a pixel position x, y that returns the cell of the position and the PSFs of the cell, in arcsec, one
+        per node.
+    shape : (int, int)
+        Shape of the image (ny, nx).
+    stamps : Stamps
+        Sizes of the stamps; objects of size 0 are not drawn.
+    pixel_scale : float, arcsec
+        Pixel scale.
+
+    Returns
+    -------
+    float32 array, shape (ny, nx), electrons
+        Image.
     """
     image = galsim.ImageD(shape[1], shape[0], xmin=0, ymin=0, scale=1.0)
-    places = [psfs(x, y)[0] if size else None for x, y, size in zip(scene.x, scene.y, stamps.size, strict=True)]
+    cells = [psfs(x, y)[0] if size else None for x, y, size in zip(scene.x, scene.y, stamps.size, strict=True)]
     first = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
-    # by place, for a place's PSFs are costly
-    for n in sorted(np.flatnonzero(stamps.size), key=lambda n: (places[n], n)):
+    # sorted by cell, because the PSFs of a cell are expensive
+    for n in sorted(np.flatnonzero(stamps.size), key=lambda n: (cells[n], n)):
         _, nodes = psfs(scene.x[n], scene.y[n])
         profile = object_profile(scene, n, first, [psf.dilate(1 / pixel_scale) for psf in nodes])
         size = int(stamps.size[n])
@@ -51,25 +64,32 @@ def draw_objects(
 
 
 def object_profile(scene: Scene, n: int, first: np.ndarray, psfs: list[galsim.GSObject]) -> galsim.GSObject:
-    """Return one object as GalSim's profile in pixels, convolved with the PSFs (pixels), one a node.
+    """Return the GalSim profile of an object in pixels, convolved with the PSF.
 
     Parameters
     ----------
-    first : (n + 1,) number of the first component of each object
+    scene : Scene
+        Objects.
+    n : int
+        Index of the object.
+    first : int array, shape (objects + 1,)
+        Index of the first component of each object.
+    psfs : list of galsim.GSObject
+        PSF at each node, in pixels.
     """
     total = scene.photons[first[n] : first[n + 1]].sum()
     parts = []
     for c in range(first[n], first[n + 1]):
-        if scene.photons[c].sum() <= LEAST_SHARE * total:
+        if scene.photons[c].sum() <= MIN_FLUX_FRACTION * total:
             continue
-        psf = galsim.Sum([one * flux for one, flux in zip(psfs, scene.photons[c], strict=True)])
+        psf = galsim.Sum([node_psf * flux for node_psf, flux in zip(psfs, scene.photons[c], strict=True)])
         source = component_profile(scene, n, c)
         parts.append(psf if source is None else galsim.Convolve(source, psf))
     return galsim.Sum(parts)
 
 
 def component_profile(scene: Scene, n: int, c: int) -> galsim.GSObject | None:
-    """Return the profile of one component, of unit flux, in pixels; None for a point."""
+    """Return the profile of component `c` of object `n`, of flux 1, in pixels; None for a point."""
     matrix = scene.matrix[c]
     if scene.kind[c] == EXPONENTIAL:
         return _transformed(galsim.Exponential(half_light_radius=1.0), matrix)
@@ -78,11 +98,12 @@ def component_profile(scene: Scene, n: int, c: int) -> galsim.GSObject | None:
     if scene.kind[c] == KNOTS:
         count = int(scene.knots[c])
         smooth = scene.smoothing[c].any()
-        spot = _transformed(galsim.Gaussian(sigma=1.0), scene.smoothing[c]) if smooth else galsim.DeltaFunction()
+        knot = _transformed(galsim.Gaussian(sigma=1.0), scene.smoothing[c]) if smooth else galsim.DeltaFunction()
         offsets = [matrix @ np.array(knot_offset(scene.key[n], k)) for k in range(count)]
-        return galsim.Sum([spot.shift(*offset) / count for offset in offsets])
+        return galsim.Sum([knot.shift(*offset) / count for offset in offsets])
     return None
 
 
 def _transformed(profile: galsim.GSObject, matrix: np.ndarray) -> galsim.GSObject:
+    """Return a profile after a linear map, with flux 1."""
     return profile.transform(*matrix.ravel()).withFlux(1.0)

@@ -1,4 +1,8 @@
-"""Chromatic PSFs that vary over a detector, sampled in Fourier space once for all stamp sizes."""
+"""Models of chromatic PSFs that vary over a detector, sampled in Fourier space once for all stamp sizes.
+
+A PSF is known at the wavelengths of a band's nodes (`Bandpass.nodes`). All transforms include the response of a pixel.
+Positions are pixel coordinates x, y, 0 at the centre of the first pixel.
+"""
 
 from __future__ import annotations
 
@@ -6,240 +10,269 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import galsim
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from scipy import fft
 
-from romandask.kernels.rendering.fourier import Frequencies, frequencies
+from romandask.kernels.rendering.fourier import Frequencies, pack_frequencies
 
-_NEGLIGIBLE = 1e-7
+_MIN_MODE_PEAK = 1e-7
 """Surface brightness of a unit star, 1/pixel, below which a mode of the PSF's variation is left out."""
-FAINTEST = 1e-5
-"""Share of a transform's largest value below which it is taken for empty."""
+MIN_POWER = 1e-5
+"""Value of a transform, in units of its largest value, below which it counts as zero."""
 CORE = 128
-"""Largest stamp, pixels, on which the variation over the detector is followed."""
+"""Side, pixels, of the largest stamps on which the variation of the PSF over the detector is modelled."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Frequencies at which transforms are sampled.
+    """Grid of frequencies at which transforms are sampled.
 
-    A stamp of N pixels needs frequencies 2 pi j / N; those of every power-of-two stamp up to `size` lie on the
-    grid of the largest, so smaller stamps stride through it.
+    A stamp of N pixels needs the frequencies 2 pi j / N. For powers of two up to `size`, they are part of the grid of
+    the largest stamp, so smaller stamps stride through it.
     """
 
     size: int
-    """Largest stamp, pixels a side, a power of two."""
+    """Side of the largest stamp, pixels, a power of two."""
     folds: int
-    """The transforms reach `folds` times the pixel grid's Nyquist frequency."""
+    """Highest frequency, in units of the Nyquist frequency of the pixel grid."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows j_y = -folds size / 2 ..., columns j_x = 0 ..., of frequencies 2 pi j / size."""
+        """Number of rows and columns.
+
+        Frequencies are 2 pi j / size with rows j_y = -folds size / 2, ... and columns j_x = 0, 1, ...
+        """
         return self.folds * self.size, self.folds * self.size // 2 + 1
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the frequencies of rows and columns, radians a pixel."""
+        """Return the frequencies of the rows and of the columns, radians per pixel."""
         rows = 2 * np.pi * np.arange(-self.shape[0] // 2, self.shape[0] // 2) / self.size
         return rows, 2 * np.pi * np.arange(self.shape[1]) / self.size
 
     def within(self, transforms: np.ndarray, size: int) -> np.ndarray:
-        """Return the transforms for stamps of at most `size` pixels."""
+        """Return transforms on this grid, strided to the grid of stamps of at most `size` pixels."""
         stride = self.size // size
         return transforms[:, ::stride, ::stride]
 
 
 @dataclass(frozen=True)
 class Variation:
-    """How the PSF at each node differs from that in the middle of the detector, at the places of `place_grid`.
+    """Differences of the PSF at positions on the detector from the PSF in the middle of the detector.
 
-    Between the places it is the polynomial of their degree through all of them.
+    The differences are known at the positions of `place_grid`. In between they are interpolated by the polynomial
+    through all of these positions.
     """
 
     shape: tuple[int, int]
-    """Detector (ny, nx)."""
+    """Shape of the detector (ny, nx)."""
     degree: int
+    """Total degree of the polynomials in x and y."""
     differences: np.ndarray
-    """(nodes, places, rows, columns) complex64 on the grid of the core."""
+    """Transforms on the grid of the core, shape (nodes, positions, rows, columns), complex64."""
 
 
 @dataclass(frozen=True)
 class BrightPsf:
-    """The PSF of the brightest stars, in more detail and further out, in the middle of a detector."""
+    """PSF of bright stars in the middle of a detector, more detailed and larger than the `PsfModel`."""
 
-    least: float
-    """Electrons from which on a star is drawn with it."""
+    min_electrons: float
+    """Smallest flux, electrons, of the stars that are drawn with this PSF."""
     grid: Grid
+    """Frequencies of the transforms."""
     nodes: Callable[[], Iterator[np.ndarray]]
-    """Returns the transforms (grid.shape), one at a time: they are large."""
+    """Function that yields the transforms (grid.shape) one at a time, because they are large."""
     shares: np.ndarray
-    """(nodes of the band, nodes of this PSF): how the light of the band's nodes is shared among its own."""
+    """Fractions of the light of the band's nodes at the nodes of this PSF, shape (band nodes, nodes of this PSF)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PsfModel:
-    """PSFs, pixel response included, of one detector and band: at the band's nodes, and over the detector."""
+    """PSF of one detector and band, as a function of wavelength and position.
+
+    On stamps up to the size of the core, the PSF is a sum of principal modes whose weights depend on wavelength and
+    position. On larger stamps, it is the PSF in the middle of the detector.
+    """
 
     nodes: np.ndarray
-    """(nodes, *grid.shape) complex64: in the middle of the detector; 1 at zero frequency."""
+    """Transforms of the PSFs in the middle of the detector, shape (nodes, *grid.shape), complex64, 1 at frequency 0."""
     grid: Grid
+    """Frequencies of `nodes`."""
     core: Grid
-    """That of stamps on which the variation over the detector is followed."""
+    """Frequencies of `modes`, those of the largest stamps on which the variation over the detector is modelled."""
     modes: np.ndarray
-    """(modes, *core.shape) complex64: the first has the light, the others none."""
+    """Transforms of the modes, shape (modes, *core.shape), complex64; all light is in the first mode."""
     mixing: np.ndarray
-    """(nodes * (1 + places), modes): each sampled PSF, or difference from that in the middle, as a sum of modes."""
+    """Weights of the modes, shape (nodes * (1 + positions), modes).
+
+    The first rows are the PSFs in the middle of the detector, the others the differences at the positions."""
     peaks: np.ndarray
-    """(modes,) largest surface brightness, 1/pixel, of each."""
+    """Largest surface brightness of each mode, shape (modes,), 1/pixel."""
     degree: int = 0
-    """Of the polynomials in place; 0 for a PSF that is the same everywhere."""
+    """Degree of the polynomials in x and y; 0 for a PSF that does not vary over the detector."""
     shape: tuple[int, int] = (1, 1)
-    """Detector (ny, nx)."""
-    # of each size of stamps once; they go with the model, as a cache of the class would not
-    _known: dict[int, Frequencies] = field(default_factory=dict, repr=False)
-    _known_wide: dict[int, Frequencies] = field(default_factory=dict, repr=False)
+    """Shape of the detector (ny, nx)."""
+    # by stamp size; held by the instance, so that they are freed with it
+    _core_frequencies: dict[int, Frequencies] = field(default_factory=dict, repr=False)
+    _wide_frequencies: dict[int, Frequencies] = field(default_factory=dict, repr=False)
 
     def weights(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the modes' weights (n, modes), float32, of light (n, nodes) at places on the detector."""
+        """Return the weights of the modes for the PSFs of n sources.
+
+        Parameters
+        ----------
+        photons : array, shape (n, nodes)
+            Electrons of each source at each node.
+        x, y : array, shape (n,), pixels
+            Positions on the detector.
+
+        Returns
+        -------
+        array, shape (n, modes), float32
+            Weights.
+        """
         parts = [photons]
         if self.degree:
-            places = place_weights(x, y, self.shape, self.degree).astype(photons.dtype)
-            width = photons.shape[1] * places.shape[1]
-            parts.append((photons[:, :, None] * places[:, None, :]).reshape(len(photons), width))
+            positions = place_weights(x, y, self.shape, self.degree).astype(photons.dtype)
+            width = photons.shape[1] * positions.shape[1]
+            parts.append((photons[:, :, None] * positions[:, None, :]).reshape(len(photons), width))
         return (np.concatenate(parts, axis=1) @ self.mixing).astype(np.float32)
 
-    def shifted(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return, as `weights`, only what the PSF at places differs by from that in the middle."""
+    def difference_weights(self, photons: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return `weights` for the differences from the PSF in the middle of the detector only."""
         return self.weights(photons, x, y) - (photons @ self.mixing[: photons.shape[1]]).astype(np.float32)
 
     def frequencies(self, stamp: int) -> Frequencies:
         """Return the modes at the frequencies of a stamp of at most core.size pixels."""
-        if stamp not in self._known:
-            self._known[stamp] = stamp_frequencies(self.modes, self._images, self.core, stamp)
-        return self._known[stamp]
+        if stamp not in self._core_frequencies:
+            self._core_frequencies[stamp] = stamp_frequencies(self.modes, self._images, self.core, stamp)
+        return self._core_frequencies[stamp]
 
     def wide_frequencies(self, stamp: int) -> Frequencies:
-        """Return the PSFs of the nodes in the middle of the detector at the frequencies of a larger stamp."""
-        if stamp not in self._known_wide:
-            self._known_wide[stamp] = self._wide(stamp)
-        return self._known_wide[stamp]
+        """Return the PSFs of the nodes in the middle of the detector at the frequencies of a stamp of any size."""
+        if stamp not in self._wide_frequencies:
+            self._wide_frequencies[stamp] = self._sample_nodes(stamp)
+        return self._wide_frequencies[stamp]
 
-    def _wide(self, stamp: int) -> Frequencies:
+    def _sample_nodes(self, stamp: int) -> Frequencies:
         fine = np.empty((len(self.nodes), 0, 0), np.float32)
-        # a stamp as large as the grid needs no image to cut
+        # a stamp as large as the grid is not cut from an image
         if stamp < self.grid.size:
             fine = np.stack([star_image(node, self.grid, self.grid.folds) for node in self.nodes])
         return stamp_frequencies(self.nodes, fine, self.grid, stamp)
 
     @cached_property
     def _images(self) -> np.ndarray:
-        """The modes as images, sampled finer than pixels by core.folds."""
+        """Images of the modes, oversampled by core.folds."""
         return np.stack([star_image(mode, self.core, self.core.folds) for mode in self.modes])
 
     @cached_property
     def edges(self) -> dict[int, float]:
-        """As `edge_brightness`."""
+        """Surface brightness of a unit star at the edges of stamps, by stamp size; see `edge_brightness`."""
         return edge_brightness(self.nodes[[0, -1]], self.grid)
 
 
 def stamp_frequencies(transforms: np.ndarray, images: np.ndarray, grid: Grid, stamp: int) -> Frequencies:
-    """Return PSFs at the frequencies of a stamp: of their light that which falls on it when they are in its middle.
+    """Return PSFs, cut to a stamp centred on them, at the frequencies of the stamp.
 
-    A transform sampled at a small stamp's frequencies would fold the light from beyond its edges into it.
+    Sampling the transform of the whole PSF at the frequencies of a small stamp would fold light from outside the stamp
+    into it.
 
     Parameters
     ----------
-    transforms : (n, *grid.shape)
-    images : (n, folds size, folds size): the same as images, sampled finer than pixels by grid.folds
+    transforms : complex array, shape (n, *grid.shape)
+        Transforms of the PSFs.
+    images : array, shape (n, folds * size, folds * size)
+        Images of the PSFs, oversampled by grid.folds; not used if the stamp is as large as the grid.
+    grid : Grid
+        Frequencies of the transforms.
+    stamp : int
+        Side of the stamp, pixels.
     """
     stride = grid.size // stamp
     power = np.abs(transforms[:, ::stride, ::stride]).max(axis=0)
-    seen = power > FAINTEST * power.max()
+    has_power = power > MIN_POWER * power.max()
     if stride == 1:
-        return frequencies(transforms, seen, stamp)
-    return frequencies(np.stack([_cut(image, grid.folds, stamp) for image in images]), seen, stamp)
+        return pack_frequencies(transforms, has_power, stamp)
+    return pack_frequencies(np.stack([_cut(image, grid.folds, stamp) for image in images]), has_power, stamp)
 
 
 def _cut(image: np.ndarray, folds: int, size: int) -> np.ndarray:
-    """Return the transform, on the grid of `size` pixels, of the middle of an image that is finer by `folds`."""
-    return np.fft.fftshift(fft.rfft2(fft.ifftshift(_middle(image, folds * size))) / folds**2, axes=0)
+    """Return the transform of the middle `size` pixels of an image that is oversampled by `folds`."""
+    return np.fft.fftshift(fft.rfft2(fft.ifftshift(middle_of(image, folds * size))) / folds**2, axes=0)
+
+
+def middle_of(image: np.ndarray, side: int) -> np.ndarray:
+    """Return a copy of the middle of an image; its centre stays on the sample len(image) / 2."""
+    low = image.shape[0] // 2 - side // 2
+    return image[low : low + side, low : low + side].copy()
 
 
 def edge_brightness(transforms: np.ndarray, grid: Grid) -> dict[int, float]:
-    """Return the largest surface brightness (1/pixel) of a unit star with any of some PSFs at the edge of each stamp.
+    """Return the surface brightness of a unit star at the edges of stamps, for the PSF that is brightest there.
 
     Parameters
     ----------
-    transforms : (n, *grid.shape): of the first and the last node, say
+    transforms : complex array, shape (n, *grid.shape)
+        Transforms of the PSFs, for example those of the first and the last node of a band.
+    grid : Grid
+        Frequencies of the transforms.
+
+    Returns
+    -------
+    dict of int to float
+        Largest surface brightness, 1/pixel, at the edge, by stamp size.
     """
-    found: dict[int, float] = {}
+    brightness: dict[int, float] = {}
     offset = np.abs(np.arange(grid.size) - grid.size // 2)
     ring = np.maximum(offset[:, None], offset[None, :])
     for transform in transforms:
         image = np.abs(star_image(transform, grid))
         size = 16
         while size <= grid.size:
-            # a ring a few pixels wide, for the diffraction rings have nulls
+            # the maximum over several pixels, because the PSF has nulls between its diffraction rings
             width = max(size // 16, 2)
             at_edge = image[(ring <= size // 2) & (ring > size // 2 - width)].max()
-            found[size] = max(found.get(size, 0.0), float(at_edge))
+            brightness[size] = max(brightness.get(size, 0.0), float(at_edge))
             size *= 2
-    return found
+    return brightness
 
 
 def star_image(transform: np.ndarray, grid: Grid, fine: int = 1) -> np.ndarray:
-    """Return the image (size, size) of a unit star centred on the pixel size / 2; sampled finer by `fine` if asked."""
-    side = grid.folds * grid.size
-    full = fft.fftshift(fft.irfft2(np.fft.ifftshift(transform, axes=0), s=(side, side)))
-    # sampling an image finer by `folds` at pixel centres is folding its transform
-    return full[:: grid.folds // fine, :: grid.folds // fine] * grid.folds**2
-
-
-def fine_image(psf: PsfModel, shares: np.ndarray, x: float, y: float, side: int, oversampling: int) -> np.ndarray:
-    """Return the image (side * oversampling, square) of a unit star at a place, sampled finer than its pixels.
+    """Return the image of a unit star, shape (size * fine, size * fine).
 
     Parameters
     ----------
-    shares : (nodes,) of the star's light by node; they sum to 1
-    side : native pixels that the image covers
-    oversampling : samples along a pixel; the star is centred on sample side * oversampling / 2
+    transform : complex array, shape (grid.shape)
+        Transform of the PSF.
+    grid : Grid
+        Frequencies of the transform.
+    fine : int
+        Oversampling, a divisor of grid.folds. The star is centred on the sample size * fine / 2.
     """
-    shares = np.asarray(shares, float)
-    image = _finer(np.tensordot(shares.astype(np.float32), psf.nodes, 1), psf.grid, oversampling)
-    image = _middle(image, side * oversampling)
-    if psf.degree:
-        weights = psf.shifted(shares[None], np.array([x]), np.array([y]))[0]
-        change = _finer(np.tensordot(weights, psf.modes, 1), psf.core, oversampling)
-        inside = _middle(change, min(len(change), len(image)))
-        low = (len(image) - len(inside)) // 2
-        image[low : low + len(inside), low : low + len(inside)] += inside
-    return image
-
-
-def _finer(transform: np.ndarray, grid: Grid, oversampling: int) -> np.ndarray:
-    """Return the image (grid.size * oversampling, square) of a transform, centred on the sample in the middle."""
-    rows, columns = grid.shape
-    # frequencies beyond the optics' reach are empty: padded with zeros, or more of them, they make finer samples
-    fine = grid.size * oversampling * -(-rows // (grid.size * oversampling))
-    padded = np.zeros((fine, fine // 2 + 1), np.complex64)
-    padded[fine // 2 - rows // 2 : fine // 2 + rows // 2, :columns] = transform
-    image = fft.fftshift(fft.irfft2(np.fft.ifftshift(padded, axes=0), s=(fine, fine))) * (fine / grid.size) ** 2
-    step = fine // (grid.size * oversampling)
-    return image[::step, ::step]
-
-
-def _middle(image: np.ndarray, side: int) -> np.ndarray:
-    """Return the middle of an image that is centred on the sample in its middle, the same way."""
-    low = image.shape[0] // 2 - side // 2
-    return image[low : low + side, low : low + side].copy()
+    side = grid.folds * grid.size
+    full = fft.fftshift(fft.irfft2(np.fft.ifftshift(transform, axes=0), s=(side, side)))
+    # taking every (folds / fine)-th sample of the image is the same as folding its transform
+    return full[:: grid.folds // fine, :: grid.folds // fine] * grid.folds**2
 
 
 def place_grid(shape: tuple[int, int], degree: int) -> np.ndarray:
-    """Return the places (n, 2), x and y, 0 at the centre of the first pixel, at which the variation is sampled.
+    """Return the positions on a detector at which the variation of a PSF is sampled.
 
-    They are the Padua points, (degree + 1) (degree + 2) / 2 of them, through which polynomials of that total degree in
-    the plane are interpolated best (Caliari, De Marchi & Vianello 2005).
+    They are the (degree + 1) (degree + 2) / 2 Padua points, the best nodes for interpolation in the plane by
+    polynomials of a total degree (Caliari, De Marchi & Vianello 2005).
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Shape of the detector (ny, nx).
+    degree : int
+        Total degree of the polynomials in x and y; at least 1.
+
+    Returns
+    -------
+    array, shape (n, 2), pixels
+        x and y of each position.
     """
     points = [
         (np.cos(j * np.pi / degree), np.cos(k * np.pi / (degree + 1)))
@@ -251,12 +284,23 @@ def place_grid(shape: tuple[int, int], degree: int) -> np.ndarray:
 
 
 def place_weights(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: int) -> np.ndarray:
-    """Return the weights (n, places) of the places of `place_grid`; an object off the detector is as at its edge."""
-    known = _polynomials(*place_grid(shape, degree).T, shape, degree)
-    return _polynomials(np.asarray(x, float), np.asarray(y, float), shape, degree) @ np.linalg.inv(known)
+    """Return the weights, shape (n, positions), by which values at the positions of `place_grid` are interpolated.
+
+    Parameters
+    ----------
+    x, y : array, shape (n,), pixels
+        Positions; those outside the detector are moved to its edge.
+    shape : (int, int)
+        Shape of the detector (ny, nx).
+    degree : int
+        Total degree of the polynomials.
+    """
+    at_nodes = _polynomials(*place_grid(shape, degree).T, shape, degree)
+    return _polynomials(np.asarray(x, float), np.asarray(y, float), shape, degree) @ np.linalg.inv(at_nodes)
 
 
 def _polynomials(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: int) -> np.ndarray:
+    """Return the products of Chebyshev polynomials up to a total degree, shape (n, polynomials)."""
     across, up = (
         chebvander(np.clip(2 * (value + 0.5) / side - 1, -1, 1), degree)
         for value, side in zip((x, y), shape[::-1], strict=True)
@@ -264,85 +308,70 @@ def _polynomials(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: i
     return np.stack([across[:, i] * up[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
 
 
-def sample(profile: galsim.GSObject, pixel_scale: float, grid: Grid, diffusion: float = 0.0) -> np.ndarray:
-    """Return the transform (grid.shape), complex64, of a profile (arcsec) convolved with the response of a pixel.
+def pixel_response(grid: Grid, diffusion: float) -> np.ndarray:
+    """Return the transform of the response of a square pixel and of charge diffusion.
 
     Parameters
     ----------
-    diffusion : sigma, pixels, of the Gaussian by which charge diffuses before it is collected; 0 for none
+    grid : Grid
+        Frequencies.
+    diffusion : float, pixels
+        Sigma of the Gaussian by which charge diffuses before it is collected; 0 for no diffusion.
+
+    Returns
+    -------
+    float32 array, shape (grid.shape)
+        Transform.
     """
-    rows, columns = grid.shape
-    # half the plane is enough, which GalSim's underscored method, alone, can draw
-    bounds = galsim.BoundsI(0, columns - 2, -rows // 2, rows // 2 - 1)
-    image = galsim.ImageCF(bounds, scale=2 * np.pi / (grid.size * pixel_scale))
-    profile._drawKImage(image)
-    out = np.zeros(grid.shape, np.complex64)
-    # the last column, half the sampling frequency of the folded grid, is beyond every profile's reach
-    np.multiply(image.array, response_of(grid, diffusion)[:, :-1], out=out[:, :-1])
-    out[0] = 0
-    return out
-
-
-def response_of(grid: Grid, diffusion: float) -> np.ndarray:
-    """Return the transform of a square pixel and of the diffusion of charge."""
     up, across = (np.sinc(axis / (2 * np.pi)) * np.exp(-((axis * diffusion) ** 2) / 2) for axis in grid.axes())
     return (up[:, None] * across[None, :]).astype(np.float32)
 
 
-def folds_of(profiles: list[galsim.GSObject], pixel_scale: float) -> int:
-    """Return how many times the Nyquist frequency of the pixels the transforms of profiles reach."""
-    reach = max(profile.maxk for profile in profiles) * pixel_scale
-    return int(np.clip(np.ceil(reach / np.pi), 1, 4))
-
-
-def sample_model(profiles: list[galsim.GSObject], pixel_scale: float, size: int, diffusion: float = 0.0) -> PsfModel:
-    """Return the model of PSF profiles (arcsec, in the frame of the pixels), one a node, the same everywhere.
+def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> PsfModel:
+    """Return the model of sampled PSFs: their mean and the principal modes of the differences.
 
     Parameters
     ----------
-    profiles : unit-flux GalSim profiles, one a node
-    pixel_scale : arcsec
-    size : largest stamp, pixels a side, a power of two
-    diffusion : sigma of charge diffusion, pixels
+    nodes : complex64 array, shape (nodes, *grid.shape)
+        Transforms of the PSFs in the middle of the detector.
+    grid : Grid
+        Frequencies of the transforms.
+    variation : Variation, optional
+        Differences over the detector; None for a PSF that does not vary.
     """
-    grid = Grid(size, folds_of(profiles, pixel_scale))
-    return model(np.stack([sample(profile, pixel_scale, grid, diffusion) for profile in profiles]), grid)
-
-
-def model(nodes: np.ndarray, grid: Grid, variation: Variation | None = None) -> PsfModel:
-    """Return the model of sampled PSFs: their mean and the principal modes of what they differ by."""
     core = Grid(min(grid.size, CORE), grid.folds)
-    centre = grid.within(nodes, core.size)
+    core_nodes = grid.within(nodes, core.size)
     if core.size < grid.size:
-        # the light beyond the core's edges would be folded into it
-        power = np.abs(centre).max(axis=0)
-        seen = power > FAINTEST * power.max()
-        centre = np.stack([_cut(star_image(node, grid, grid.folds), grid.folds, core.size) * seen for node in nodes])
-    mean = centre.mean(axis=0)
-    rest = (centre - mean).reshape(len(nodes), -1)
+        # without the cut, light outside the core would be folded into it
+        power = np.abs(core_nodes).max(axis=0)
+        has_power = power > MIN_POWER * power.max()
+        core_nodes = np.stack(
+            [_cut(star_image(node, grid, grid.folds), grid.folds, core.size) * has_power for node in nodes]
+        )
+    mean = core_nodes.mean(axis=0)
+    differences = (core_nodes - mean).reshape(len(nodes), -1)
     if variation is not None:
-        rest = np.concatenate([rest, variation.differences.reshape(-1, rest.shape[1])])
-    # columns but the first stand for two frequencies each
+        differences = np.concatenate([differences, variation.differences.reshape(-1, differences.shape[1])])
+    # each column except the first stands for two frequencies
     weight = np.full(core.shape, 2.0, np.float32)
     weight[:, 0] = 1.0
-    gram = ((rest * weight.ravel()) @ rest.conj().T).real
-    power, vectors = np.linalg.eigh(gram.astype(float))
-    strongest = np.argsort(power)[::-1]
-    strongest = strongest[power[strongest] > 1e-12 * power.max(initial=1e-30)]
-    modes = (vectors[:, strongest].T.astype(np.float32) @ rest).reshape(-1, *core.shape)
+    gram = ((differences * weight.ravel()) @ differences.conj().T).real
+    variances, vectors = np.linalg.eigh(gram.astype(float))
+    strongest = np.argsort(variances)[::-1]
+    strongest = strongest[variances[strongest] > 1e-12 * variances.max(initial=1e-30)]
+    modes = (vectors[:, strongest].T.astype(np.float32) @ differences).reshape(-1, *core.shape)
     peaks = np.array([np.abs(star_image(mode, core, core.folds)).max() for mode in modes])
-    largest = peaks * np.abs(vectors[:, strongest]).max(axis=0, initial=0.0)
-    kept = largest > _NEGLIGIBLE
+    kept = peaks * np.abs(vectors[:, strongest]).max(axis=0, initial=0.0) > _MIN_MODE_PEAK
     mixing = vectors[:, strongest][:, kept]
-    light = np.zeros((len(rest), 1))
-    light[: len(nodes)] = 1.0
+    mean_weight = np.zeros((len(differences), 1))
+    mean_weight[: len(nodes)] = 1.0
     return PsfModel(
-        nodes,
-        grid,
-        core,
-        np.concatenate([mean[None], modes[kept]]).astype(np.complex64),
-        np.concatenate([light, mixing], axis=1).astype(np.float32),
-        np.concatenate([[np.abs(star_image(mean, core, core.folds)).max()], peaks[kept]]),
-        variation.degree if variation is not None else 0,
-        variation.shape if variation is not None else (1, 1),
+        nodes=nodes,
+        grid=grid,
+        core=core,
+        modes=np.concatenate([mean[None], modes[kept]]).astype(np.complex64),
+        mixing=np.concatenate([mean_weight, mixing], axis=1).astype(np.float32),
+        peaks=np.concatenate([[np.abs(star_image(mean, core, core.folds)).max()], peaks[kept]]),
+        degree=variation.degree if variation is not None else 0,
+        shape=variation.shape if variation is not None else (1, 1),
     )

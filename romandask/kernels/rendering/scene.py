@@ -1,4 +1,4 @@
-"""From truth rows to a scene on an image: positions, shapes, lensing and photons in pixels and electrons."""
+"""Conversion of truth catalog rows to a scene on an image: positions and shapes in pixels, lensing, electrons."""
 
 from __future__ import annotations
 
@@ -10,41 +10,57 @@ from astropy.wcs import WCS
 
 from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
-from romandask.kernels.universe.synthetic_photometry import Dust, Spectra, no_dust, node_photons
+from romandask.kernels.universe.dust import Dust, no_dust
+from romandask.kernels.universe.synthetic_photometry import Spectra, node_photons
 from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra
 
 COMPONENTS = ("bulge", "disk", "knots")
+"""Components of galaxies. Knots share the size and the dust of the disk."""
 
-
+# reasons for which an object is not drawn; empty for one that is drawn
 DRAWN = ""
-NO_PLACE = "position that the image's WCS cannot reach"
+NO_POSITION = "position that the image's WCS cannot reach"
 BAD_SIZE = "size that is not a positive number"
 BAD_LENSING = "shear and convergence beyond weak lensing, or not numbers"
 BAD_FLUX = "flux that is not a number or overflows"
 NO_LIGHT = "no light in this band"
 OFF_IMAGE = "no light on the image"
-"""Why an object is not drawn."""
-MOST_FLUX = 1e15
-"""Electrons, beyond which the image could not hold an object with any precision."""
+MAX_FLUX = 1e15
+"""Flux, electrons, from which on an object is not drawn, because the image would lose all precision."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Rows of the truth catalogs near one image, with the spectra they refer to."""
+    """Rows of the truth catalogs near one image, with their spectra."""
 
     galaxies: pd.DataFrame
+    """Rows of catalogs/galaxies.yaml."""
     stars: pd.DataFrame
+    """Rows of catalogs/stars.yaml."""
     galaxy_spectra: dict[str, Spectra]
-    """By component."""
+    """Spectra of the galaxies, by component."""
     star_spectra: Spectra
+    """Spectra of the stars."""
     internal_frame: str
-    """"rest" or "observed": where the galaxies' own dust acts."""
+    """Frame in which the internal dust of galaxies acts, "rest" or "observed"."""
 
 
 def bind(
     galaxies: pd.DataFrame, stars: pd.DataFrame, library: SpectrumLibrary, edges: tuple[float, ...], frame: str
 ) -> Truth:
-    """Return rows together with the spectra they refer to."""
+    """Return truth rows with their spectra.
+
+    Parameters
+    ----------
+    galaxies, stars : pandas.DataFrame
+        Rows of the truth catalogs.
+    library : SpectrumLibrary
+        Spectra that the rows refer to by index.
+    edges : tuple of float, nm
+        Rest-frame edges of the bins of top-hat spectra; empty if there are none.
+    frame : {"rest", "observed"}
+        Frame in which the internal dust of galaxies acts.
+    """
     return Truth(
         galaxies,
         stars,
@@ -57,23 +73,32 @@ def bind(
 def component_spectra(
     galaxies: pd.DataFrame, component: str, library: SpectrumLibrary, edges: tuple[float, ...]
 ) -> Spectra:
-    """Return the spectra of a component: top-hats where the rows hold any, else those of the library."""
+    """Return the spectra of a component: top-hat spectra if any row has one, else library spectra.
+
+    Parameters are those of `bind`.
+    """
     bins = galaxies[f"sed_val_{component}"]
     if not any(len(row) for row in bins):
         return LibrarySpectra(library, galaxies[f"{component}_sed"].to_numpy(int))
     # a component without light may have no spectrum
-    dark = np.zeros(len(edges) - 1)
-    return TophatSpectra(np.stack([row if len(row) else dark for row in bins]).astype(float), np.array(edges))
+    zeros = np.zeros(len(edges) - 1)
+    return TophatSpectra(np.stack([row if len(row) else zeros for row in bins]).astype(float), np.array(edges))
 
 
 def magnification(galaxies: pd.DataFrame) -> np.ndarray:
-    """Return mu = 1 / ((1 - kappa)^2 - gamma^2) of each galaxy."""
+    """Return the lensing magnification mu = 1 / ((1 - kappa)^2 - gamma^2) of each galaxy."""
     shear2 = galaxies["shear_1"] ** 2 + galaxies["shear_2"] ** 2
     return (1 / ((1 - galaxies["convergence"]) ** 2 - shear2)).to_numpy(float)
 
 
 def galaxy_photons(truth: Truth, bandpass: Bandpass, component: str) -> np.ndarray:
-    """Return photons per second (n, nodes) of one component of the galaxies, lensing magnification included."""
+    """Return the photon rates of one component of the galaxies, with lensing magnification.
+
+    Returns
+    -------
+    array, shape (galaxies, nodes), photons/s
+        Photon rates at the PSF nodes of the band.
+    """
     rows = truth.galaxies
     dust = "bulge" if component == "bulge" else "disk"
     photons = node_photons(
@@ -89,7 +114,7 @@ def galaxy_photons(truth: Truth, bandpass: Bandpass, component: str) -> np.ndarr
 
 
 def star_photons(truth: Truth, bandpass: Bandpass) -> np.ndarray:
-    """Return photons per second (n, nodes) of the stars."""
+    """Return the photon rates of the stars, shape (stars, nodes), photons/s, at the PSF nodes of a band."""
     rows = truth.stars
     return node_photons(
         rows["magnorm"].to_numpy(float),
@@ -102,10 +127,18 @@ def star_photons(truth: Truth, bandpass: Bandpass) -> np.ndarray:
 
 
 def shape_matrices(galaxies: pd.DataFrame, component: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 2, 2) from a round profile of half-light radius 1 to the sky, unlensed, and the lensing itself.
+    """Return the linear maps of shape and lensing of one component of the galaxies.
 
-    The sky frame is GalSim's, (west, north) in arcsec: a position angle p east of north is the direction p + 90 deg
-    from west through north, and (shear_1, shear_2) are GalSim's on-sky components. The half-light radius is sqrt(a b).
+    The sky frame is that of GalSim, (west, north) in arcsec. In this frame a position angle p, east of north, is the
+    direction p + 90 deg from west through north, and (shear_1, shear_2) are GalSim's on-sky components. The half-light
+    radius is sqrt(a b).
+
+    Returns
+    -------
+    shape : array, shape (n, 2, 2)
+        Map from a round profile of half-light radius 1 to the unlensed profile on the sky, arcsec.
+    lens : array, shape (n, 2, 2)
+        Map from the unlensed to the lensed sky.
     """
     size = "bulge" if component == "bulge" else "disk"
     major = galaxies[f"size_{size}_true"].to_numpy(float)
@@ -117,16 +150,28 @@ def shape_matrices(galaxies: pd.DataFrame, component: str) -> tuple[np.ndarray, 
     shape = (rotation * np.stack([major, minor], -1)[:, None, :]) @ rotation.transpose(0, 2, 1)
     kappa = galaxies["convergence"].to_numpy(float)
     g1, g2 = (galaxies[name].to_numpy(float) / (1 - kappa) for name in ("shear_1", "shear_2"))
-    # area grows by mu, axis ratio changes by the reduced shear: inverse of [[1 - g1, -g2], [-g2, 1 + g1]] (1 - kappa)
+    # inverse of (1 - kappa) [[1 - g1, -g2], [-g2, 1 + g1]], where (g1, g2) is the reduced shear; its determinant is mu
     lens = np.stack([np.stack([1 + g1, g2], -1), np.stack([g2, 1 - g1], -1)], -2)
     lens /= ((1 - g1**2 - g2**2) * (1 - kappa))[:, None, None]
     return shape, lens
 
 
 def pixel_positions(wcs: WCS, ra, dec) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pixel x, y (0 at the first pixel's centre) and the local matrix (n, 2, 2) from (west, north) to pixels.
+    """Return pixel positions and the local linear maps from the sky to pixels.
 
-    Positions that the WCS cannot reach (the other side of the sky) are NaN.
+    Parameters
+    ----------
+    wcs : astropy.wcs.WCS
+        WCS of the image.
+    ra, dec : array, shape (n,), degrees
+        Positions.
+
+    Returns
+    -------
+    x, y : array, shape (n,), pixels
+        Positions, 0 at the centre of the first pixel; NaN where the WCS is not defined (the other side of the sky).
+    to_pixels : array, shape (n, 2, 2)
+        Maps from offsets (west, north) in arcsec to pixels.
     """
     ra, dec = np.atleast_1d(np.asarray(ra, float)), np.atleast_1d(np.asarray(dec, float))
     if not len(ra):
@@ -137,6 +182,7 @@ def pixel_positions(wcs: WCS, ra, dec) -> tuple[np.ndarray, np.ndarray, np.ndarr
     lon, lat = lon.reshape(4, -1), lat.reshape(4, -1)
 
     def west_north(a: int, b: int) -> np.ndarray:
+        """Return the offset from corner b to corner a, arcsec."""
         west = -((lon[a] - lon[b] + 180) % 360 - 180) * np.cos(np.radians(dec))
         return np.stack([west, lat[a] - lat[b]], -1) * 3600
 
@@ -146,17 +192,20 @@ def pixel_positions(wcs: WCS, ra, dec) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 @dataclass(frozen=True)
 class Drawable:
-    """The objects of a truth that can be drawn on an image, and why the others cannot."""
+    """The objects that can be drawn on an image, and the reasons for which others cannot.
+
+    m is the number of all objects of the `Truth`, galaxies first, then stars; n is the number of objects of the scene.
+    """
 
     scene: Scene
     rows: np.ndarray
-    """(n,) which of the truth's objects, galaxies before stars, each of the scene is; ascending."""
+    """Index among the m objects of each object of the scene, shape (n,), ascending."""
     reasons: np.ndarray
-    """(all objects of the truth,) DRAWN where an object is in the scene, else why it is not; object dtype."""
+    """DRAWN for an object of the scene, else the reason why it is not drawn, shape (m,), object dtype."""
     x: np.ndarray
-    """(all objects,) pixel coordinate, 0 at the centre of the first pixel; NaN where the WCS has none."""
+    """Pixel coordinate along x, 0 at the centre of the first pixel, shape (m,); NaN where the WCS is not defined."""
     y: np.ndarray
-    """(all objects,)"""
+    """Pixel coordinate along y, as `x`."""
 
 
 def build_scene(
@@ -169,13 +218,22 @@ def build_scene(
 ) -> Drawable:
     """Return the scene of an image.
 
+    Objects that cannot be drawn are left out, each with a reason, so that no invalid value reaches a pixel.
+
     Parameters
     ----------
-    exptime : seconds (electrons = photons per second times this)
-    knot_smoothing : sigma, arcsec, of the Gaussian that smooths each knot before lensing; 0 for none
-    within : shape of the image, and how far, pixels, from it objects are kept; None for all
-
-    Objects that cannot be drawn are left out, each with a reason: no value of theirs reaches a pixel.
+    truth : Truth
+        Rows of the truth catalogs.
+    wcs : astropy.wcs.WCS
+        WCS of the image.
+    bandpass : Bandpass
+        Band.
+    exptime : float, s
+        Exposure time; electrons are photon rates times this.
+    knot_smoothing : float, arcsec
+        Sigma of the Gaussian that smooths each knot before lensing; 0 for no smoothing.
+    within : ((int, int), float), optional
+        Shape of the image (ny, nx), and the distance from it, pixels, to which objects are kept; None to keep all.
     """
     galaxies, stars = truth.galaxies, truth.stars
     n = len(galaxies)
@@ -183,29 +241,29 @@ def build_scene(
     x, y, to_pixels = pixel_positions(wcs, ra, dec)
     reasons = np.full(len(ra), DRAWN, object)
     reasons[:n] = _galaxy_faults(galaxies)
-    placed = np.isfinite(x) & np.isfinite(y) & np.isfinite(to_pixels).all(axis=(1, 2))
-    reasons[~placed] = NO_PLACE
+    has_position = np.isfinite(x) & np.isfinite(y) & np.isfinite(to_pixels).all(axis=(1, 2))
+    reasons[~has_position] = NO_POSITION
     if within is not None:
-        (ny, nx), reach = within
+        (ny, nx), distance = within
         with np.errstate(invalid="ignore"):
-            near = (x > -reach) & (x < nx + reach) & (y > -reach) & (y < ny + reach)
-        reasons[placed & ~near & (reasons == DRAWN)] = OFF_IMAGE
+            near = (x > -distance) & (x < nx + distance) & (y > -distance) & (y < ny + distance)
+        reasons[has_position & ~near & (reasons == DRAWN)] = OFF_IMAGE
     kept = np.flatnonzero(reasons == DRAWN)
     truth = _rows_of(truth, kept[kept < n], kept[kept >= n] - n)
     parts = _components(truth, bandpass, exptime, to_pixels[kept], knot_smoothing)
-    # before the sum over components, which would hide what is not a number
+    # each component is checked, because a sum over components could hide one that is not finite
     flux, good = np.zeros(len(kept)), np.ones(len(kept), bool)
     for part in parts:
-        own = part.photons.sum(axis=1)
-        flux[part.owner] += np.where(np.isfinite(own), own, 0)
-        good[part.owner] &= np.isfinite(own)
-    good &= flux < MOST_FLUX
+        part_flux = part.photons.sum(axis=1)
+        flux[part.owner] += np.where(np.isfinite(part_flux), part_flux, 0)
+        good[part.owner] &= np.isfinite(part_flux)
+    good &= flux < MAX_FLUX
     reasons[kept[~good]] = BAD_FLUX
     reasons[kept[good & ~(flux > 0)]] = NO_LIGHT
     lit = np.flatnonzero(good & (flux > 0))
-    place = np.full(len(kept), -1)
-    place[lit] = np.arange(len(lit))
-    owner = np.concatenate([place[part.owner] for part in parts])
+    scene_index = np.full(len(kept), -1)
+    scene_index[lit] = np.arange(len(lit))
+    owner = np.concatenate([scene_index[part.owner] for part in parts])
     used = np.flatnonzero(owner >= 0)
     order = used[np.argsort(owner[used], kind="stable")]
     key = np.r_[truth.galaxies["galaxy_id"].to_numpy(np.int64), truth.stars["id"].to_numpy(np.int64)]
@@ -225,7 +283,7 @@ def build_scene(
 
 
 def _galaxy_faults(galaxies: pd.DataFrame) -> np.ndarray:
-    """Return why galaxies cannot be drawn; a size counts where its component has light."""
+    """Return the reason why each galaxy cannot be drawn; the size of a component counts only if it has light."""
     reasons = np.full(len(galaxies), DRAWN, object)
     for component in COMPONENTS:
         size = "bulge" if component == "bulge" else "disk"
@@ -243,29 +301,45 @@ def _galaxy_faults(galaxies: pd.DataFrame) -> np.ndarray:
 def _components(
     truth: Truth, bandpass: Bandpass, exptime: float, to_pixels: np.ndarray, knot_smoothing: float
 ) -> list[_Part]:
-    """Return the lit components of galaxies and stars; owners count galaxies before stars."""
+    """Return the stars, and the components of the galaxies that have light."""
     n, m = len(truth.galaxies), len(truth.stars)
     with np.errstate(over="ignore"):
-        light = star_photons(truth, bandpass) * exptime
-    points = np.zeros((m, 2, 2))
-    parts = [_Part(np.arange(n, n + m), POINT, points, points, np.zeros(m, int), light)]
+        photons = star_photons(truth, bandpass) * exptime
+    zeros = np.zeros((m, 2, 2))
+    stars = _Part(
+        owner=np.arange(n, n + m),
+        kind=POINT,
+        matrix=zeros,
+        smoothing=zeros,
+        knots=np.zeros(m, int),
+        photons=photons,
+    )
+    parts = [stars]
     kinds = {"bulge": DEVAUCOULEURS, "disk": EXPONENTIAL, "knots": KNOTS}
     for component in COMPONENTS:
         shape, lens = shape_matrices(truth.galaxies, component)
         with np.errstate(over="ignore", invalid="ignore"):
             photons = galaxy_photons(truth, bandpass, component) * exptime
+            # keeps NaN, which is reported as BAD_FLUX later
             rows = np.flatnonzero(~(photons.sum(axis=1) <= 0))
-        smoothing, counts = np.zeros((len(rows), 2, 2)), np.zeros(len(rows), int)
+        smoothing, knots = np.zeros((len(rows), 2, 2)), np.zeros(len(rows), int)
         if component == "knots":
             smoothing = (to_pixels[:n] @ lens)[rows] * knot_smoothing
-            counts = truth.galaxies["n_knots"].fillna(0).to_numpy(int)[rows]
-        matrix = (to_pixels[:n] @ lens @ shape)[rows]
-        parts.append(_Part(rows, kinds[component], matrix, smoothing, counts, photons[rows]))
+            knots = truth.galaxies["n_knots"].fillna(0).to_numpy(int)[rows]
+        part = _Part(
+            owner=rows,
+            kind=kinds[component],
+            matrix=(to_pixels[:n] @ lens @ shape)[rows],
+            smoothing=smoothing,
+            knots=knots,
+            photons=photons[rows],
+        )
+        parts.append(part)
     return parts
 
 
 def _rows_of(truth: Truth, galaxies: np.ndarray, stars: np.ndarray) -> Truth:
-    """Return some galaxies and stars of a truth."""
+    """Return the galaxies and the stars with some row numbers."""
     return Truth(
         truth.galaxies.iloc[galaxies],
         truth.stars.iloc[stars],
@@ -275,8 +349,10 @@ def _rows_of(truth: Truth, galaxies: np.ndarray, stars: np.ndarray) -> Truth:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Part:
+    """Components of one kind, with the fields of `Scene`; `owner` counts the galaxies first, then the stars."""
+
     owner: np.ndarray
     kind: int
     matrix: np.ndarray

@@ -1,4 +1,4 @@
-"""Stars of the Galaxy in one direction: how many, how bright and how hot, from a model of its disks and halo."""
+"""Milky Way stars in one direction: counts, magnitudes and temperatures from a model of the disks and the halo."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import numpy as np
 import pandas as pd
 from astropy.coordinates import SkyCoord
 
+from romandask.kernels.universe.dust import ALL_DUST, Dust, no_dust
 from romandask.kernels.universe.galaxies import CELL_ORDER, positions
-from romandask.kernels.universe.galaxy_rows import REFERENCE, flux_columns
-from romandask.kernels.universe.synthetic_photometry import SEEN, Dust, LibrarySpectra, band_photons, njy, no_dust
+from romandask.kernels.universe.galaxy_rows import REFERENCE_BAND, flux_columns
+from romandask.kernels.universe.synthetic_photometry import band_photons, njy
 from romandask.model.seeds import rng
 from romandask.model.sky import cell_area
-from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, SpectrumLibrary
+from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, LibrarySpectra, SpectrumLibrary
 
-LUMINOSITY = np.array(
+LUMINOSITY_FUNCTION = np.array(
     [
         [-1, 0.03],
         [0, 0.1],
@@ -39,9 +40,10 @@ LUMINOSITY = np.array(
         [16, 2.5],
     ]
 )
-"""M_r against stars of the solar neighbourhood a 1000 pc3 and magnitude, rounded: Wielen, Jahreiss and Krueger 1983 to
-M_r = 7, Bochanski et al. 2010 beyond."""
-TEMPERATURE = np.array(
+"""Luminosity function of the solar neighbourhood: M_r, and stars per 1000 pc3 and magnitude, rounded.
+
+Wielen, Jahreiss and Krueger 1983 to M_r = 7, Bochanski et al. 2010 beyond."""
+DWARF_TEMPERATURES = np.array(
     [
         [-1, 15000],
         [0, 10500],
@@ -63,32 +65,33 @@ TEMPERATURE = np.array(
         [16, 2450],
     ]
 )
-"""M_r against the effective temperature, K, of dwarfs (Pecaut and Mamajek 2013)."""
+"""M_r, and effective temperature in K, of dwarfs (Pecaut and Mamajek 2013)."""
 TEMPERATURES = tuple(int(round(2400 * (15000 / 2400) ** (k / 39), -1)) for k in range(40))
-"""Of the blackbodies that stand for stars where no library is given, K."""
+"""Temperatures, K, of the blackbody spectra of stars, which are used if no library of spectra is given."""
 BRIGHTEST, FAINTEST = 12.0, 29.0
+"""Range of r magnitudes of generated stars."""
 SUN_RADIUS, SUN_HEIGHT = 8000.0, 25.0
-"""pc"""
+"""Distance of the Sun from the Galactic centre, and height above the plane, pc."""
 
 
 @dataclass(frozen=True)
 class Sightline:
-    """Stars in one direction."""
+    """Star counts in one direction, in m bins of r magnitude and k bins of absolute magnitude."""
 
     edges: np.ndarray
-    """(m + 1,) r magnitude."""
-    luminosities: np.ndarray
-    """(k,) M_r."""
+    """Edges of the bins of r, shape (m + 1,), mag."""
+    absolute_magnitudes: np.ndarray
+    """Centres of the bins of M_r, shape (k,), mag."""
     counts: np.ndarray
-    """(m, k) stars a square arcminute."""
+    """Stars per square arcminute, shape (m, k)."""
 
 
 @lru_cache(maxsize=4)
 def sightline(ra: float, dec: float) -> Sightline:
-    """Return the stars in a direction (degrees), r from BRIGHTEST to FAINTEST.
+    """Return the star counts in a direction (degrees), for r from BRIGHTEST to FAINTEST.
 
-    Thin and thick exponential disks and an oblate halo with the parameters of Juric et al. 2008 (table 10, corrected
-    for binaries), the local luminosity function everywhere; no dust along the line.
+    The model consists of a thin and a thick exponential disk and an oblate halo, with the parameters of Juric et al.
+    2008 (table 10, corrected for binaries) and the local luminosity function everywhere. It has no dust.
     """
     galactic = SkyCoord(ra * u.deg, dec * u.deg).galactic
     distance = np.geomspace(5, 2e5, 1200)
@@ -105,13 +108,13 @@ def sightline(ra: float, dec: float) -> Sightline:
     steps = np.gradient(distance)
     solid_angle = (np.pi / 180 / 60) ** 2
     edges = np.arange(BRIGHTEST, FAINTEST + 0.05, 0.1)
-    luminosities = np.arange(LUMINOSITY[0, 0], LUMINOSITY[-1, 0] + 0.05, 0.1)
-    local = np.interp(luminosities, *LUMINOSITY.T) * 1e-3 * 0.1
-    counts = np.zeros((len(edges) - 1, len(luminosities)))
-    for k, (absolute, number) in enumerate(zip(luminosities, local, strict=True)):
-        seen = absolute + 5 * np.log10(distance / 10)
-        counts[:, k] = np.histogram(seen, edges, weights=number * density * distance**2 * steps * solid_angle)[0]
-    return Sightline(edges, luminosities, counts)
+    absolute_magnitudes = np.arange(LUMINOSITY_FUNCTION[0, 0], LUMINOSITY_FUNCTION[-1, 0] + 0.05, 0.1)
+    local_density = np.interp(absolute_magnitudes, *LUMINOSITY_FUNCTION.T) * 1e-3 * 0.1
+    counts = np.zeros((len(edges) - 1, len(absolute_magnitudes)))
+    for k, (absolute, number) in enumerate(zip(absolute_magnitudes, local_density, strict=True)):
+        apparent = absolute + 5 * np.log10(distance / 10)
+        counts[:, k] = np.histogram(apparent, edges, weights=number * density * distance**2 * steps * solid_angle)[0]
+    return Sightline(edges, absolute_magnitudes, counts)
 
 
 def star_rows(
@@ -126,35 +129,55 @@ def star_rows(
     bands: tuple[str, ...],
     milky_way_av: float,
 ) -> pd.DataFrame:
-    """Return the stars of some cells of order CELL_ORDER as rows of catalogs/stars.yaml.
+    """Return the stars of some cells as rows of the truth catalog (catalogs/stars.yaml).
 
     Parameters
     ----------
-    density : stars to r < 29 a square arcminute; the model gives their distribution
-    spectra : the library's rows of stars, whose temperatures, K, are `temperatures`: each star takes the nearest
+    cells : int array
+        HEALPix cells of order CELL_ORDER, nested scheme.
+    seed : int
+        Seed of the survey.
+    density : float, 1/arcmin2
+        Stars with r < 29; the model gives their distribution over magnitude only.
+    line : Sightline
+        Star counts of the model.
+    library : SpectrumLibrary
+        Spectra.
+    spectra : range
+        Indices of the star spectra in the library.
+    temperatures : array, K
+        Temperatures of these spectra; each star gets the spectrum nearest in ln(temperature).
+    bandpasses : tuple of Bandpass
+        Bands in which fluxes are computed; must include REFERENCE_BAND and `bands`.
+    bands : tuple of str
+        Bands of the flux columns.
+    milky_way_av : float, mag
+        A_V of the Milky Way.
     """
-    drawn, cell_of_star, index = [], [], []
+    uniforms, star_cells, numbers = [], [], []
     for cell in cells:
         random = rng(seed, "truth", "stars", int(cell))
         n = random.poisson(density * cell_area(CELL_ORDER))
-        drawn.append(random.random((n, 4)))
-        cell_of_star.append(np.full(n, cell))
-        index.append(np.arange(n))
-    uniform = np.concatenate(drawn) if drawn else np.empty((0, 4))
-    cell = np.concatenate(cell_of_star).astype(np.int64) if drawn else np.empty(0, np.int64)
+        uniforms.append(random.random((n, 4)))
+        star_cells.append(np.full(n, cell))
+        numbers.append(np.arange(n))
+    uniform = np.concatenate(uniforms) if uniforms else np.empty((0, 4))
+    cell = np.concatenate(star_cells).astype(np.int64) if uniforms else np.empty(0, np.int64)
     ra, dec = positions(cell, uniform[:, 0])
-    magnitude, absolute = _brightness(line, uniform[:, 1], uniform[:, 2])
-    heat = np.interp(absolute, *TEMPERATURE.T)
-    sed = spectra.start + np.abs(np.log(temperatures)[None] - np.log(heat)[:, None]).argmin(axis=1)
+    magnitude, absolute = _magnitudes(line, uniform[:, 1], uniform[:, 2])
+    temperature = np.interp(absolute, *DWARF_TEMPERATURES.T)
+    sed = spectra.start + np.abs(np.log(temperatures)[None] - np.log(temperature)[:, None]).argmin(axis=1)
     n = len(sed)
     dust = Dust(np.full(n, milky_way_av), np.full(n, 3.1))
-    chosen = LibrarySpectra(library, sed)
-    unit = band_photons(np.zeros(n), chosen, np.zeros(n), no_dust(n), dust, bandpasses)
+    star_spectra = LibrarySpectra(library, sed)
+    at_magnorm_0 = band_photons(np.zeros(n), star_spectra, np.zeros(n), no_dust(n), dust, bandpasses)
     names = [bandpass.name for bandpass in bandpasses]
-    r_band = names.index(REFERENCE)
-    magnorm = magnitude + 2.5 * np.log10(njy(unit[SEEN, :, r_band], bandpasses[r_band]) / NJY_ZERO_POINT)
+    r_band = names.index(REFERENCE_BAND)
+    r_flux = njy(at_magnorm_0[ALL_DUST, :, r_band], bandpasses[r_band])
+    magnorm = magnitude + 2.5 * np.log10(r_flux / NJY_ZERO_POINT)
     frame = {
-        "id": (cell << 24) + (1 << 23) + np.concatenate(index or [np.empty(0, int)]),
+        # bit 23 distinguishes stars from the galaxies of the same cell
+        "id": (cell << 24) + (1 << 23) + np.concatenate(numbers or [np.empty(0, int)]),
         "ra": ra,
         "dec": dec,
         "magnorm": magnorm,
@@ -164,16 +187,16 @@ def star_rows(
     }
     for band in bands:
         k = names.index(band)
-        frame |= flux_columns(band, njy(unit[:, :, k] * 10 ** (-0.4 * magnorm), bandpasses[k]))
+        frame |= flux_columns(band, njy(at_magnorm_0[:, :, k] * 10 ** (-0.4 * magnorm), bandpasses[k]))
     return pd.DataFrame(frame)
 
 
-def _brightness(line: Sightline, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return r and M_r from their joint distribution."""
-    flat = np.concatenate([[0.0], np.cumsum(line.counts.ravel())])
-    position = np.interp(first, flat / flat[-1], np.arange(len(flat)))
-    bin_of = np.minimum(position.astype(int), len(flat) - 2)
-    row, column = np.divmod(bin_of, line.counts.shape[1])
-    within = line.edges[row] + second * np.diff(line.edges)[row]
-    # within its bin of luminosity a star is where the position fell
-    return within, line.luminosities[column] + 0.1 * (position - bin_of - 0.5)
+def _magnitudes(line: Sightline, uniform_1: np.ndarray, uniform_2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return random r and M_r from their joint distribution, from two uniform random numbers per star."""
+    cumulative = np.concatenate([[0.0], np.cumsum(line.counts.ravel())])
+    position = np.interp(uniform_1, cumulative / cumulative[-1], np.arange(len(cumulative)))
+    bin_index = np.minimum(position.astype(int), len(cumulative) - 2)
+    row, column = np.divmod(bin_index, line.counts.shape[1])
+    apparent = line.edges[row] + uniform_2 * np.diff(line.edges)[row]
+    # the fractional part of the position is the position of the star in its bin of M_r
+    return apparent, line.absolute_magnitudes[column] + 0.1 * (position - bin_index - 0.5)

@@ -20,7 +20,7 @@ from romandask.kernels.measurement.extract import (
     psf_half_light_radius,
     select,
 )
-from romandask.kernels.universe.synthetic_photometry import extinction
+from romandask.kernels.universe.dust import extinction
 from romandask.model.settings import DetectionSettings
 from romandask.model.sky import Region, unit_vectors
 from romandask.model.tiles import Tile, TileGrid

@@ -16,7 +16,7 @@ from astropy.wcs import WCS
 from romandask.instruments.exposure import Exposure, exposure_of, exposures_of
 from romandask.instruments.instrument import Instrument
 from romandask.kernels.detectors.simple_detector import Detector, usable
-from romandask.kernels.rendering.psf import fine_image
+from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.model.settings import RenderSettings
 from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.image_set import ImageSet

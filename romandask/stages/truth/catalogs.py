@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from romandask.ingest import spectra as spectra_files
 from romandask.kernels.rendering.scene import Truth, bind
-from romandask.kernels.universe.synthetic_photometry import Dust
+from romandask.kernels.universe.dust import Dust
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region, cell_area, cells_in_cone, unit_vectors

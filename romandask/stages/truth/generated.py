@@ -12,7 +12,7 @@ from romandask.ingest.spectra import blackbodies, every_file, galaxy_templates, 
 from romandask.kernels.universe import galaxies, galaxy_rows, milky_way_stars
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.kernels.universe.flux_table import FluxTable, flux_table
-from romandask.kernels.universe.structure import LENSED, MAX_REDSHIFT, Structure, bytes_of, shells, structure
+from romandask.kernels.universe.structure import FIELD_NAMES, MAX_REDSHIFT, Structure, bytes_of, shells, structure
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region
@@ -82,7 +82,7 @@ def matter(settings: TruthSettings, region: Region, seed: int) -> ImageProduct:
     planes = tuple(
         Variable(name, "float32", (count, len(pixels)), ("shell", "pixel"), {"units": "1", "long_name": text})
         for name, text in zip(
-            LENSED,
+            FIELD_NAMES,
             (
                 "contrast of matter in a shell",
                 "relative density of galaxies in a shell",

@@ -12,12 +12,13 @@ import pandas as pd
 from romandask.ingest import instance_catalog, skycatalogs, table
 from romandask.ingest.rows import COMPONENTS, Batch, Source, merge_components
 from romandask.kernels.rendering.scene import component_spectra, magnification
+from romandask.kernels.universe.dust import Dust, no_dust
 from romandask.kernels.universe.galaxy_rows import flux_columns
-from romandask.kernels.universe.synthetic_photometry import Dust, LibrarySpectra, band_photons, njy, no_dust
+from romandask.kernels.universe.synthetic_photometry import band_photons, njy
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region
-from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, SpectrumLibrary
+from romandask.model.spectra import NJY_ZERO_POINT, Bandpass, LibrarySpectra, SpectrumLibrary
 from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct

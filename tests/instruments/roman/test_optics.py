@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from romandask.instruments.roman.optics import MIDDLE, WideNodes, optics, transforms
-from romandask.kernels.rendering.psf import Grid, sample, star_image
+from romandask.kernels.rendering.galsim_sampling import sample
+from romandask.kernels.rendering.psf import Grid, star_image
 
 PIXEL = galsim.roman.pixel_scale
 

@@ -13,8 +13,14 @@ from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.rubin.rubin import DEGREE, Rubin, RubinSettings
 from romandask.kernels.coadding.warp import REACH
 from romandask.kernels.rendering.psf import place_grid
-from romandask.kernels.rendering.seeing import ALIGNMENT, DESIGN, FIELD, TURBULENCE, pattern
-from romandask.kernels.rendering.silicon import LEAST
+from romandask.kernels.rendering.seeing import (
+    ATMOSPHERE_RMS,
+    FIELD_RADIUS,
+    TELESCOPE_ELLIPTICITY_RMS,
+    TELESCOPE_SIZE_GROWTH,
+    pattern,
+)
+from romandask.kernels.rendering.silicon import MIN_ELECTRONS
 from romandask.model.seeds import rng
 from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
@@ -90,19 +96,19 @@ def test_the_psf_varies_as_the_pattern_of_its_visit_says():
     every = np.stack([pattern(rng(1, "psf", k)).atmosphere([0.0, 4000.0], [0.0, -2000.0]) for k in range(2000)])
     size, plus = every[..., :2].mean(axis=-1), (every[..., 0] - every[..., 1]) / 2
     for part in (size, plus, every[..., 2]):
-        assert part.mean() == pytest.approx(0, abs=4 * TURBULENCE / np.sqrt(2000))
-        assert part.std() == pytest.approx(TURBULENCE, rel=0.1)
+        assert part.mean() == pytest.approx(0, abs=4 * ATMOSPHERE_RMS / np.sqrt(2000))
+        assert part.std() == pytest.approx(ATMOSPHERE_RMS, rel=0.1)
     # near by the turbulence is the same, far off it is another
     near = np.stack([pattern(rng(1, "psf", k)).atmosphere([0.0, 20.0], [0.0, 0.0]) for k in range(500)])[..., 2]
     assert np.corrcoef(near.T)[0, 1] > 0.98
     assert abs(np.corrcoef(every[..., 2].T)[0, 1]) < 0.3
     middle, edge = (
         np.stack([pattern(rng(1, "psf", k)).telescope(np.array([r]), np.array([0.0])) for k in range(500)])[:, 0]
-        for r in (0.0, FIELD)
+        for r in (0.0, FIELD_RADIUS)
     )
     growth = edge[:, :2].mean() - middle[:, :2].mean()
-    assert growth == pytest.approx(DESIGN, rel=1e-6)
-    assert (middle[:, 0] - middle[:, 1]).std() / 2 == pytest.approx(ALIGNMENT * np.sqrt(0.5), rel=0.15)
+    assert growth == pytest.approx(TELESCOPE_SIZE_GROWTH, rel=1e-6)
+    assert (middle[:, 0] - middle[:, 1]).std() / 2 == pytest.approx(TELESCOPE_ELLIPTICITY_RMS * np.sqrt(0.5), rel=0.15)
 
 
 def test_over_a_detector_the_psf_is_galsims_of_every_place():
@@ -220,4 +226,4 @@ def test_bright_stars_are_fatter_through_silicon_and_keep_their_flux():
     assert 1e-3 < np.median(growth) * 1e6 < 3e-2
     # what is drawn without silicon is the same in both, and so is the noiseless image
     np.testing.assert_allclose(made["ideal"]["truth"], made["silicon"]["truth"], rtol=1e-4, atol=0.5)
-    assert (fluxes[chosen] > LEAST).all()
+    assert (fluxes[chosen] > MIN_ELECTRONS).all()

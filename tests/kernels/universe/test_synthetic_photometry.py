@@ -1,4 +1,4 @@
-"""Photon rates against GalSim's own SED and Bandpass arithmetic."""
+"""Synthetic photometry compared with GalSim's SED and Bandpass classes."""
 
 from pathlib import Path
 
@@ -11,18 +11,9 @@ from dust_extinction.parameter_averages import CCM89, F19
 
 from romandask.ingest.spectra import blackbodies, galaxy_templates, joined, read_folder
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass, rubin_bandpass
+from romandask.kernels.universe.dust import ALL_DUST, INTERNAL_DUST, NO_DUST, Dust, no_dust, transmission
 from romandask.kernels.universe.flux_table import flux_table
-from romandask.kernels.universe.synthetic_photometry import (
-    CLEAR,
-    NO_MILKY_WAY,
-    SEEN,
-    Dust,
-    band_photons,
-    njy,
-    no_dust,
-    node_photons,
-    transmission,
-)
+from romandask.kernels.universe.synthetic_photometry import band_photons, njy, node_photons
 from romandask.model.spectra import LibrarySpectra, SpectrumLibrary, TophatSpectra
 
 NAMES = ("CWW_E", "CWW_Sbc", "CWW_Scd", "CWW_Im")
@@ -38,7 +29,8 @@ def library():
 
 def galsim_rate(name, magnorm, redshift, bandpass, area, dust=None):
     sed = galsim.SED(f"{name}_ext_more.sed", "Ang", "flambda").withMagnitude(magnorm, AT_500).atRedshift(redshift)
-    # GalSim's trapezoids take the nodes of spectrum and bandpass: dense ones, or its own error is 5e-4 mag
+    # GalSim integrates by trapezoids over the samples of spectrum and bandpass: without the dense samples of this table
+    # its error is 5e-4 mag
     wave = np.linspace(300, 2200, 8000)
     table = galsim.LookupTable(wave, np.ones_like(wave) if dust is None else dust(wave), interpolant="linear")
     sed = sed * galsim.SED(table, "nm", "1")
@@ -47,9 +39,9 @@ def galsim_rate(name, magnorm, redshift, bandpass, area, dust=None):
 
 def rates(library, rows, bandpass, internal=None, milky_way=None):
     sed, magnorm, redshift = (np.array(column) for column in zip(*rows, strict=True))
-    clear = no_dust(len(rows))
+    dust_free = no_dust(len(rows))
     return node_photons(
-        magnorm, LibrarySpectra(library, sed), redshift, internal or clear, milky_way or clear, bandpass
+        magnorm, LibrarySpectra(library, sed), redshift, internal or dust_free, milky_way or dust_free, bandpass
     )
 
 
@@ -67,19 +59,23 @@ def test_rates_agree_with_galsim(library, band):
     np.testing.assert_allclose(-2.5 * np.log10(measured / expected), 0, atol=1.5e-4)
 
 
-def test_dust_acts_in_its_own_frame(library):
+def test_dust_acts_in_the_rest_frame_or_the_observed_frame(library):
     bandpass, reference = rubin_bandpass("g", 5, 3e5), galsim.Bandpass("LSST_g.dat", "nm")
     dust = Dust(np.full(1, 0.4), np.full(1, 2.7))
     milky_way = rates(library, [(2, 24.0, 0.8)], bandpass, milky_way=dust).sum()
-    outer = galsim_rate(NAMES[2], 24.0, 0.8, reference, 3e5, lambda wave: transmission("F19", wave, 0.4, 2.7))
-    assert -2.5 * np.log10(milky_way / outer) == pytest.approx(0, abs=2e-4)
+    expected_milky_way = galsim_rate(
+        NAMES[2], 24.0, 0.8, reference, 3e5, lambda wave: transmission("F19", wave, 0.4, 2.7)
+    )
+    assert -2.5 * np.log10(milky_way / expected_milky_way) == pytest.approx(0, abs=2e-4)
     internal = rates(library, [(2, 24.0, 0.8)], bandpass, internal=dust).sum()
-    inner = galsim_rate(NAMES[2], 24.0, 0.8, reference, 3e5, lambda wave: transmission("CCM", wave / 1.8, 0.4, 2.7))
-    assert -2.5 * np.log10(internal / inner) == pytest.approx(0, abs=2e-4)
-    assert internal < milky_way, "rest-frame dust is seen at shorter wavelengths, where it takes more"
+    expected_internal = galsim_rate(
+        NAMES[2], 24.0, 0.8, reference, 3e5, lambda wave: transmission("CCM", wave / 1.8, 0.4, 2.7)
+    )
+    assert -2.5 * np.log10(internal / expected_internal) == pytest.approx(0, abs=2e-4)
+    assert internal < milky_way, "rest-frame dust acts at shorter wavelengths, where extinction is stronger"
 
 
-def test_the_papers_dust_acts_where_it_is_seen(library):
+def test_internal_dust_can_act_in_the_observed_frame_as_in_the_paper(library):
     bandpass, reference = rubin_bandpass("g", 5, 3e5), galsim.Bandpass("LSST_g.dat", "nm")
     dust = Dust(np.full(1, 0.4), np.full(1, 3.1))
     spectra = LibrarySpectra(library, np.array([1]))
@@ -90,60 +86,64 @@ def test_the_papers_dust_acts_where_it_is_seen(library):
 
 @pytest.mark.parametrize("law", ["CCM", "F19"])
 @pytest.mark.parametrize("rv", [2.6, 3.1, 4.4])
-def test_dust_laws_are_dust_extinctions_own(law, rv):
+def test_transmission_agrees_with_dust_extinction(law, rv):
     wave = np.array([150.0, 250.0, 440.0, 549.5, 900.0, 2100.0])
     model = {"CCM": CCM89, "F19": F19}[law](Rv=rv)
     np.testing.assert_allclose(transmission(law, wave, 0.7, rv), model.extinguish(1e3 / wave / u.um, Av=0.7), rtol=1e-6)
 
 
-def test_a_ratio_that_would_brighten_is_refused(library):
+def test_too_small_rv_is_rejected_unless_av_is_zero(library):
     with pytest.raises(ValueError, match="R_V below"):
         rates(library, [(0, 24.0, 0.1)], rubin_bandpass("g", 5, 1.0), internal=Dust(np.ones(1), np.full(1, 0.5)))
-    # no dust has no ratio
     assert (
         rates(library, [(0, 24.0, 0.1)], rubin_bandpass("g", 5, 1.0), internal=Dust(np.zeros(1), np.zeros(1))).sum() > 0
     )
 
 
-def test_fluxes_of_all_bands_are_those_of_the_nodes_with_each_dust(library):
+def test_band_photons_are_the_sums_of_node_photons_for_each_dust(library):
     random = np.random.default_rng(2)
     n = 50
     sed, z = random.integers(0, 4, n), random.uniform(0, 3, n)
-    own, outer = (Dust(random.uniform(0, 1.5, n), random.uniform(2.5, 5, n)) for _ in range(2))
+    internal, milky_way = (Dust(random.uniform(0, 1.5, n), random.uniform(2.5, 5, n)) for _ in range(2))
     bandpasses = (rubin_bandpass("u", 5, 1.0), rubin_bandpass("i", 5, 1.0), roman_bandpass("F184", 5))
     spectra = LibrarySpectra(library, sed)
-    found = band_photons(np.full(n, 22.0), spectra, z, own, outer, bandpasses)
-    for kind, (inner, last) in {SEEN: (own, outer), NO_MILKY_WAY: (own, no_dust(n)), CLEAR: (no_dust(n),) * 2}.items():
+    measured = band_photons(np.full(n, 22.0), spectra, z, internal, milky_way, bandpasses)
+    dusts = {
+        ALL_DUST: (internal, milky_way),
+        INTERNAL_DUST: (internal, no_dust(n)),
+        NO_DUST: (no_dust(n), no_dust(n)),
+    }
+    for index, pair in dusts.items():
         for k, bandpass in enumerate(bandpasses):
-            expected = node_photons(np.full(n, 22.0), spectra, z, inner, last, bandpass).sum(axis=1)
-            np.testing.assert_allclose(found[kind, :, k], expected, rtol=1e-9)
+            expected = node_photons(np.full(n, 22.0), spectra, z, *pair, bandpass).sum(axis=1)
+            np.testing.assert_allclose(measured[index, :, k], expected, rtol=1e-9)
 
 
-def test_the_table_of_fluxes_interpolates_to_a_ten_thousandth_of_a_magnitude(library):
+def test_flux_table_agrees_with_band_photons_to_1e_4_mag(library):
     random = np.random.default_rng(3)
     n = 3000
     four = SpectrumLibrary(library.names[:4], library.wave, library.photons[:4], library.limits[:4])
     bandpasses = (rubin_bandpass("u", 2, 1.0), rubin_bandpass("r", 2, 1.0), roman_bandpass("H158", 2))
     table = flux_table(four, bandpasses, "rest", 3.02)
     sed, z = random.integers(0, 4, n), random.uniform(0, 3.3, n)
-    own, outer, mag = random.uniform(0, 2.4, n), random.uniform(0, 0.25, n), random.uniform(18, 30, n)
+    internal_av, mw_av, mag = random.uniform(0, 2.4, n), random.uniform(0, 0.25, n), random.uniform(18, 30, n)
     mag[7] = np.inf
     rv = np.full(n, 3.1)
-    measured = table.photons(mag, sed, z, own, outer)
-    expected = band_photons(mag, LibrarySpectra(four, sed), z, Dust(own, rv), Dust(outer, rv), bandpasses)
+    measured = table.photons(mag, sed, z, internal_av, mw_av)
+    expected = band_photons(mag, LibrarySpectra(four, sed), z, Dust(internal_av, rv), Dust(mw_av, rv), bandpasses)
     lit = expected > 0
     np.testing.assert_allclose(2.5 * np.log10(measured[lit] / expected[lit]), 0, atol=1e-4)
     assert (measured[:, 7] == 0).all()
 
 
-def test_a_flat_spectrum_has_its_ab_magnitude():
-    # bins hold f_lambda constant: many narrow ones make a flat f_nu
+def test_a_flat_spectrum_has_the_ab_magnitude_magnorm():
+    # f_lambda is constant within a bin: a flat f_nu needs many narrow bins
     edges = np.exp(np.linspace(np.log(200), np.log(2500), 600))
     flat = TophatSpectra(np.full((1, 599), 7.0), edges)
-    clear = no_dust(1)
+    dust_free = no_dust(1)
     for band in ("H158", "Y106"):
         bandpass = roman_bandpass(band, 5)
-        rate = node_photons(np.full(1, 22.0), flat, np.zeros(1), clear, clear, bandpass).sum()
+        rate = node_photons(np.full(1, 22.0), flat, np.zeros(1), dust_free, dust_free, bandpass).sum()
         assert 31.4 - 2.5 * np.log10(njy(rate, bandpass)) == pytest.approx(22.0, abs=2e-2)
 
 
@@ -152,29 +152,29 @@ def test_tophat_spectra_agree_with_galsim():
     edges = np.array([100, 150, 250, 350, 450, 480, 510, 560, 640, 760, 900, 1200, 1700, 2100.0])
     values = random.uniform(1, 3, (3, len(edges) - 1))
     redshift = np.array([0.1, 0.5, 1.2])
-    clear = no_dust(3)
+    dust_free = no_dust(3)
     bandpass, reference = rubin_bandpass("r", 5, 1.0), galsim.Bandpass("LSST_r.dat", "nm")
-    measured = node_photons(np.full(3, 20.0), TophatSpectra(values, edges), redshift, clear, clear, bandpass)
+    measured = node_photons(np.full(3, 20.0), TophatSpectra(values, edges), redshift, dust_free, dust_free, bandpass)
     flambda = values * (1 / edges[:-1] - 1 / edges[1:]) / np.diff(edges)
     speed = 2.99792458e17  # nm / s
     for row in range(3):
         wave = np.stack([edges[:-1], edges[1:] - 1e-6], 1).ravel()
-        # f_lambda in erg/s/cm2/nm of a source whose f_nu in the bin of 500 nm is that of magnorm 20
+        # f_lambda, erg/s/cm2/nm, of a source whose f_nu in the bin of 500 nm corresponds to magnorm 20
         absolute = np.repeat(flambda[row], 2) / values[row, 5] * 3.631e-20 * 10**-8 * speed
         sed = galsim.SED(galsim.LookupTable(wave, absolute, interpolant="linear"), "nm", "flambda")
         expected = sed.atRedshift(redshift[row]).calculateFlux(reference)
         assert measured[row].sum() == pytest.approx(expected, rel=2e-4)
 
 
-def test_no_light_is_no_photons(library):
+def test_infinite_or_nan_magnorm_gives_no_photons(library):
     rows = [(0, np.inf, 0.5), (0, np.nan, 0.5), (0, 20.0, 0.5)]
-    found = rates(library, rows, roman_bandpass("H158", 5)).sum(axis=1)
-    assert found[0] == 0
-    assert found[1] == 0
-    assert found[2] > 0
+    measured = rates(library, rows, roman_bandpass("H158", 5)).sum(axis=1)
+    assert measured[0] == 0
+    assert measured[1] == 0
+    assert measured[2] > 0
 
 
-def test_spectra_from_a_folder_give_reasons_for_what_is_missing(shared):
+def test_read_folder_gives_the_reason_for_each_spectrum_that_is_not_read(shared):
     good = "starSED/kurucz/km10_4750.fits_g00_4790.gz"
     library, reasons = read_folder(shared / "seds", [good, "starSED/kurucz/none.gz", "../opsim/small_opsim_9683.db"])
     assert library.names == (good,)

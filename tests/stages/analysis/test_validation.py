@@ -8,7 +8,7 @@ from astropy import units as u
 from dust_extinction.parameter_averages import F19
 
 from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.kernels.universe.synthetic_photometry import Dust, extinction
+from romandask.kernels.universe.dust import Dust, extinction
 from romandask.report import figures
 from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth
 

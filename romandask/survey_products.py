@@ -105,10 +105,10 @@ class SurveyProducts:
         }
         return self._stored(
             TableProduct(
-                f"pointings/{survey}",
-                (Unit("all", state),),
-                _MakePointings(self, survey),
-                schema("pointings"),
+                stage=f"pointings/{survey}",
+                units=(Unit("all", state),),
+                make=_MakePointings(self, survey),
+                schema=schema("pointings"),
                 bytes_per_unit=1 << 30,
             )
         )

@@ -46,15 +46,15 @@ def margin(product: TableProduct) -> TableProduct:
         return Unit(product.names[index], {"width": WIDTH, "rim": RIM_ORDER}, inputs)
 
     return TableProduct(
-        product.stage + MARGIN,
-        LazyUnits(product.names, unit),
-        _MakeMargin(product, order),
-        product.schema,
-        product.pixels,
-        product.order,
-        product.bytes_per_unit,
-        0.05 * product.seconds_per_unit,
-        product.store,
+        stage=product.stage + MARGIN,
+        units=LazyUnits(product.names, unit),
+        make=_MakeMargin(product, order),
+        schema=product.schema,
+        pixels=product.pixels,
+        order=product.order,
+        bytes_per_unit=product.bytes_per_unit,
+        seconds_per_unit=0.05 * product.seconds_per_unit,
+        store=product.store,
     )
 
 

@@ -37,7 +37,7 @@ Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
 """By name: axes, values, attributes."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class ImageProduct:
     """Images over units; `dataset` is the lazy xarray view."""
 

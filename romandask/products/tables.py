@@ -19,7 +19,7 @@ from romandask.storage.paths import AnyPath, remove
 from romandask.storage.store import Store, read_parquet, write_parquet
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class TableProduct:
     """A table over units, HEALPix partitions or others; `frame` is the lazy dask DataFrame."""
 

@@ -263,14 +263,14 @@ def exposures(
         }
 
     return ImageProduct(
-        stage_of(instrument),
-        LazyUnits(tuple(names), unit),
-        RenderExposure(table, truth, instrument, render, seed, readout, store),
-        _variables(instrument.shape, readout),
-        axes,
-        (len(table),),
-        coordinates,
-        {"survey": instrument.name},
+        stage=stage_of(instrument),
+        units=LazyUnits(tuple(names), unit),
+        make=RenderExposure(table, truth, instrument, render, seed, readout, store),
+        variables=_variables(instrument.shape, readout),
+        axes=axes,
+        lengths=(len(table),),
+        coordinates=coordinates,
+        attributes={"survey": instrument.name},
         # image, truth, dq, background and working copies; the wide PSF of one node, as it is sampled or as it is
         # drawn; the objects, and the PSFs of a detector and band, the last and the new
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),

@@ -45,14 +45,14 @@ def psfs(exposures: ImageProduct) -> ImageProduct:
         "pixel_scale": instrument.pixel_scale / OVERSAMPLING,
     }
     return ImageProduct(
-        f"psfs/{instrument.name}",
-        LazyUnits(exposures.names, unit),
-        MakePsf(source),
-        (Variable("psf", "float32", (side, side), ("v", "u"), text),),
-        exposures.axes,
-        exposures.lengths,
-        exposures.coordinates,
-        {"survey": instrument.name},
+        stage=f"psfs/{instrument.name}",
+        units=LazyUnits(exposures.names, unit),
+        make=MakePsf(source),
+        variables=(Variable("psf", "float32", (side, side), ("v", "u"), text),),
+        axes=exposures.axes,
+        lengths=exposures.lengths,
+        coordinates=exposures.coordinates,
+        attributes={"survey": instrument.name},
         bytes_per_unit=350 << 20,
         seconds_per_unit=0.7,
     )

@@ -28,10 +28,10 @@ def truth_index(exposures: ImageProduct) -> TableProduct:
         return exposures.units[row]
 
     return TableProduct(
-        f"truth_index/{source.instrument.name}",
-        LazyUnits(exposures.names, unit),
-        MakeIndex(source),
-        schema("truth_index"),
+        stage=f"truth_index/{source.instrument.name}",
+        units=LazyUnits(exposures.names, unit),
+        make=MakeIndex(source),
+        schema=schema("truth_index"),
         bytes_per_unit=int(np.prod(source.instrument.shape)) * 16 + (520 << 20),
         seconds_per_unit=1.2,
     )

@@ -31,7 +31,15 @@ def images(count: int) -> ImageProduct:
     units = tuple(Unit(f"u{k}", k) for k in range(count))
     names = np.array([f"u{k}" for k in range(count)], object)
     coordinates = {"exposure": (("exposure",), names, {})}
-    return ImageProduct("exposures/x", units, make, (PLANE,), ("exposure",), (count,), lambda: coordinates)
+    return ImageProduct(
+        stage="exposures/x",
+        units=units,
+        make=make,
+        variables=(PLANE,),
+        axes=("exposure",),
+        lengths=(count,),
+        coordinates=lambda: coordinates,
+    )
 
 
 def test_images_come_back_and_grow_with_their_units(tmp_path):
@@ -154,7 +162,9 @@ def test_tables_keep_to_their_schema():
 
 def test_a_lazy_table_is_its_units(tmp_path):
     schema = pa.schema([pa.field("a", pa.int64())])
-    product = TableProduct("t", (Unit("0", 0), Unit("1", 1)), lambda k: pd.DataFrame({"a": [k, k + 10]}), schema)
+    product = TableProduct(
+        stage="t", units=(Unit("0", 0), Unit("1", 1)), make=lambda k: pd.DataFrame({"a": [k, k + 10]}), schema=schema
+    )
     assert product.frame.compute(scheduler="synchronous")["a"].tolist() == [0, 10, 1, 11]
 
 

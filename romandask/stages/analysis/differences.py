@@ -56,16 +56,16 @@ def differences(
     }
     ratio = (blunt.source.instrument.coadd_scale / sharp.source.instrument.coadd_scale) ** 2
     return ImageProduct(
-        f"differences/{name}",
-        tuple(unit(k) for k in range(len(blunt.maker.tiles))),
-        maker,
-        tuple(
+        stage=f"differences/{name}",
+        units=tuple(unit(k) for k in range(len(blunt.maker.tiles))),
+        make=maker,
+        variables=tuple(
             Variable(key, "float32", shape, axes, {"units": "nJy", "long_name": value}) for key, value in text.items()
         ),
-        ("tile",),
-        (len(blunt.maker.tiles),),
-        lambda: {key: value for key, value in coadds.coordinates().items() if value[0] == ("tile",)},
-        {"survey": name, "pixel_scale": blunt.source.instrument.coadd_scale},
+        axes=("tile",),
+        lengths=(len(blunt.maker.tiles),),
+        coordinates=lambda: {key: value for key, value in coadds.coordinates().items() if value[0] == ("tile",)},
+        attributes={"survey": name, "pixel_scale": blunt.source.instrument.coadd_scale},
         # planes of the tile, those of the basis among them; a strip of the sharper one and its transforms
         bytes_per_unit=int(pixels**2 * 75 + pixels * ratio * (ROWS + 200) * 30 + (280 << 20)),
         seconds_per_unit=pixels**2 * ratio * 4e-7,

@@ -83,14 +83,14 @@ def coadds(exposures: ImageProduct, tiles: list[Tile], settings: CoaddSettings) 
     planes = 2 + settings.noise
     mean = np.mean([len(chosen) for chosen in members.values()])
     return ImageProduct(
-        f"coadds/{instrument.name}",
-        LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
-        maker,
-        _planes(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
-        ("tile", "band"),
-        (len(tiles), len(instrument.bands)),
-        coordinates,
-        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+        stage=f"coadds/{instrument.name}",
+        units=LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
+        make=maker,
+        variables=_planes(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
+        axes=("tile", "band"),
+        lengths=(len(tiles), len(instrument.bands)),
+        coordinates=coordinates,
+        attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
         bytes_per_unit=max(
             pixels**2 * ((3 if drizzled else 45) + 4 * planes)

@@ -63,14 +63,14 @@ def detections(coadds: ImageProduct, settings: DetectionSettings, region: Region
     units = tuple(Unit(tile.name, {**state, "tile": tile.name}, inputs(k, tile)) for k, tile in enumerate(maker.tiles))
     text = {"long_name": "number of the object, the last 24 bits of its objectId; 0 for none"}
     return ImageProduct(
-        f"detections/{instrument.name}",
-        units,
-        DetectTile(coadds, settings, region),
-        (Variable("segmentation", "int32", (pixels, pixels), ("y", "x"), text),),
-        ("tile",),
-        (len(units),),
-        lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
-        {"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
+        stage=f"detections/{instrument.name}",
+        units=units,
+        make=DetectTile(coadds, settings, region),
+        variables=(Variable("segmentation", "int32", (pixels, pixels), ("y", "x"), text),),
+        axes=("tile",),
+        lengths=(len(units),),
+        coordinates=lambda: {name: value for name, value in coadds.coordinates().items() if value[0] == ("tile",)},
+        attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # three planes, a mask and some chunks of all bands; after that a band's two planes and the map of objects
         bytes_per_unit=pixels**2 * 13 + (420 << 20),
         seconds_per_unit=pixels**2 * 7e-7,
@@ -108,13 +108,13 @@ def objects(
         for cell, members in tiles_of.items()
     )
     return TableProduct(
-        f"objects/{maker.instrument.name}",
-        units,
-        CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
-        detections.tables["objects"],
-        tuple(tiles_of),
-        settings.order,
-        400 << 20,
+        stage=f"objects/{maker.instrument.name}",
+        units=units,
+        make=CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
+        schema=detections.tables["objects"],
+        pixels=tuple(tiles_of),
+        order=settings.order,
+        bytes_per_unit=400 << 20,
     )
 
 

@@ -33,10 +33,10 @@ def truth_match(detections: ImageProduct, settings: DetectionSettings) -> TableP
     state = {"radius": settings.match_radius, "band": reference_band(render.instrument)}
     units = _units(detections, detections.stage, state)
     return TableProduct(
-        f"truth_match/{render.instrument.name}",
-        units,
-        MatchTile(detections, settings),
-        schema("truth_match"),
+        stage=f"truth_match/{render.instrument.name}",
+        units=units,
+        make=MatchTile(detections, settings),
+        schema=schema("truth_match"),
         bytes_per_unit=600 << 20,
         seconds_per_unit=0.5,
     )
@@ -48,10 +48,10 @@ def truth_summary(matched: TableProduct, detections: ImageProduct, settings: Det
     bands = render.instrument.bands
     units = _units(detections, matched.stage, {"faintest": settings.summary_magnitude, "bands": bands})
     return TableProduct(
-        f"truth_summary/{render.instrument.name}",
-        units,
-        SummariseTile(matched, detections, settings),
-        schema("truth_summary", bands),
+        stage=f"truth_summary/{render.instrument.name}",
+        units=units,
+        make=SummariseTile(matched, detections, settings),
+        schema=schema("truth_summary", bands),
         bytes_per_unit=600 << 20,
         seconds_per_unit=0.5,
     )

@@ -21,7 +21,7 @@ from romandask.products.tables import conform, to_frame
 from romandask.products.units import Made, Unit, names_of
 from romandask.storage.arrays import (
     Variable,
-    few_chunks,
+    limited_concurrency,
     open_images,
     read_group,
     write_array,
@@ -108,7 +108,7 @@ class ImageProduct:
                 opened[name] = _array(group, name)
             index: Any = (*place, ..., *window)
             # what is not compressed has no files in parts: its chunks are read as they are, ten at a time
-            with self._damage_told(name, unit), few_chunks() if opened[name].shards else nullcontext():
+            with self._damage_told(name, unit), limited_concurrency() if opened[name].shards else nullcontext():
                 return np.asarray(opened[name][index])
 
         return read

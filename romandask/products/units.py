@@ -62,7 +62,7 @@ class LazyUnits(Sequence[Unit]):
 
 
 def _unavailable(index: int) -> Unit:
-    raise RuntimeError("units are worked out where the product was put together, not where they are made")
+    raise RuntimeError("units were pickled as names only; access them in the process that constructed the product")
 
 
 def names_of(units: Sequence[Unit]) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
-"""The memory that stages state, at the full size of their units: detectors of 4088 and 4096 pixels, tiles of 8825.
+"""The peak memory that stages declare, for units of full size: detectors of 4088 and 4096 pixels, tiles of 8825.
 
-Planes decide it, hardly the sources: these skies are thin. A run at the true density is in the figures of `one_tile`.
+The memory depends on the image planes and hardly on the sources, so these surveys have few sources. The figures of the
+pipeline `one_tile` are from a run at the true density.
 """
 
 import json
@@ -14,7 +15,7 @@ from romandask.stage_graph import stages
 from romandask.storage.manifest import read_records
 from romandask.survey import open_survey
 
-THIN = ("truth.galaxies=1", "truth.nside=64", "run.memory_limit=2.0")
+FEW_SOURCES = ("truth.galaxies=1", "truth.nside=64", "run.memory_limit=2.0")
 CASES = {
     "tile": (
         "one_tile",
@@ -43,19 +44,21 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_no_unit_takes_more_than_its_stage_states(case, tmp_path):
-    """A worker of 2 GiB makes them all, one after another, with what stays in its heap; none is lost."""
+def test_no_unit_exceeds_the_memory_that_its_stage_declares(case, tmp_path):
+    """One worker of 2 GiB makes all units one after another, with the memory that stays on its heap, and survives."""
     pipeline, *overrides = CASES[case]
-    done = command("run", pipeline, "--store", "s", "--workers", "1", *overrides, *THIN, cwd=tmp_path)
+    done = command("run", pipeline, "--store", "s", "--workers", "1", *overrides, *FEW_SOURCES, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    survey, over = open_survey(tmp_path / "s"), {}
+    survey, exceeded = open_survey(tmp_path / "s"), {}
     for stage in stages(survey):
-        states = stage.product(survey).bytes_per_unit + INTERPRETER
+        declared = stage.product(survey).bytes_per_unit + INTERPRETER
         for name, record in read_records(survey.store, stage.name):
-            if record.peak_bytes > states:
-                over[f"{stage.name}/{name}"] = (record.peak_bytes / 2**30, states / 2**30)
+            if record.peak_bytes > declared:
+                exceeded[f"{stage.name}/{name}"] = (record.peak_bytes / 2**30, declared / 2**30)
             assert not [text for text in record.warnings if "memory" in text], (stage.name, name)
-    assert not over
+    assert not exceeded
     log = next((tmp_path / "s" / "log").glob("*.jsonl"))
     units = [event for event in map(json.loads, Path(log).read_text().splitlines()) if event["event"] == "unit"]
-    assert len({(event["stage"], event["unit"]) for event in units}) == len(units), "made once each: no worker was lost"
+    assert len({(event["stage"], event["unit"]) for event in units}) == len(units), (
+        "each unit was made once: no worker was lost"
+    )

@@ -92,12 +92,12 @@ def read(path: AnyPath) -> pd.DataFrame:
 
 def _table_and_columns(connection: sqlite3.Connection, path: AnyPath) -> tuple[str, dict[str, str]]:
     """Return the name of the table of visits, and the name of its column for each of our columns."""
-    found = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")]
-    tables = [name for name in TABLES if name.lower() in {other.lower() for other in found}]
+    existing = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")]
+    tables = [name for name in TABLES if name.lower() in {other.lower() for other in existing}]
     if not tables:
         raise UserError(
             f"{path}: holds no table {TABLES[0]!r}, {TABLES[1]!r} or {TABLES[2]!r} "
-            f"(found {', '.join(found) or 'none'}): not an OpSim database"
+            f"(found {', '.join(existing) or 'none'}): not an OpSim database"
         )
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({tables[0]})")]
     names = {}

@@ -32,7 +32,7 @@ class Unit:
 class LazyUnits(Sequence[Unit]):
     """Sequence of units with known names; each unit is constructed when it is accessed.
 
-    A pickled copy has the names only, and its units cannot be accessed.
+    A serialised copy, such as a worker receives, has only the names; its units cannot be accessed.
     """
 
     names: tuple[str, ...]
@@ -62,7 +62,7 @@ class LazyUnits(Sequence[Unit]):
 
 
 def _unavailable(index: int) -> Unit:
-    raise RuntimeError("units were pickled as names only; access them in the process that constructed the product")
+    raise RuntimeError("units were serialised as names only; access them in the process that constructed the product")
 
 
 def names_of(units: Sequence[Unit]) -> tuple[str, ...]:

@@ -192,7 +192,7 @@ def test_a_store_that_cannot_be_written_is_refused(tmp_path):
         Store(Path(tmp_path / "file" / "store")).prepare()
 
 
-def test_lazy_units_are_constructed_on_access_and_pickled_as_names():
+def test_lazy_units_are_constructed_on_access_and_serialised_as_names():
     constructed = []
 
     def make(index):
@@ -207,7 +207,7 @@ def test_lazy_units_are_constructed_on_access_and_pickled_as_names():
     assert constructed == [2, 0, 1]
     copy = pickle.loads(pickle.dumps(units))
     assert names_of(copy) == names_of(units)
-    with pytest.raises(RuntimeError, match="pickled as names only"):
+    with pytest.raises(RuntimeError, match="serialised as names only"):
         copy[0]
 
 

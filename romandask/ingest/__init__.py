@@ -1,1 +1,1 @@
-"""The way in: source catalogs, spectra and lists of visits, read from files into one normal form."""
+"""Readers of input files: source catalogs, which are brought into one normal form, spectra and lists of visits."""

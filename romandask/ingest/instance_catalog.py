@@ -1,9 +1,11 @@
-"""Instance catalogs of phoSim and imSim: text (or .gz) of a visit's header, `object` lines and `includeobj` files.
+"""Instance catalogs of phoSim and imSim: text files, plain or .gz, for one visit.
 
-Signs: these files mirror the sky. Their gamma_2 is -shear_2 (GCR: shear_2_phosim) and their position angles run from
-north to west (imSim's instcat.py draws the direction 90 deg - angle from west); both are turned here.
-Axes are half-light radii, arcsec. Ids of the DC2 writers are galaxy_id * 1024 + a code of the component
-(sims_GCRCatSimInterface); the ids here are galaxy_id.
+A file has a header of `key value` lines, `object` lines, and `includeobj` lines that name further files with objects.
+
+These files mirror the sky. Their gamma_2 is -shear_2 (GCR: shear_2_phosim), and their position angles run from north to
+west (imSim's instcat.py draws the direction 90 deg - angle from west); both signs are changed here. Axes are half-light
+radii, arcsec. The DC2 writers use the identifiers galaxy_id * 1024 + a code of the component
+(sims_GCRCatSimInterface); here the identifier is galaxy_id.
 """
 
 from __future__ import annotations
@@ -20,52 +22,58 @@ from typing import Any, BinaryIO
 import numpy as np
 import pandas as pd
 
-from romandask.ingest.rows import DARK, Batch, file_states, identifiers, normal_form, with_reasons
+from romandask.ingest.rows import DARK_MAGNORM, Batch, file_states, identifiers, normal_form, with_reasons
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, file_state, local_copy
 
-BLOCK = 16 << 20
-"""Bytes of text a batch; lines of DC2 have 170 to 260."""
-LONGEST = 1 << 16
-"""Bytes of a line that are looked at."""
+BLOCK_BYTES = 16 << 20
+"""Bytes of uncompressed text per batch; the lines of DC2 have 170 to 260 bytes."""
+MAX_LINE_BYTES = 1 << 16
+"""Length, bytes, up to which lines are read completely."""
 CODES = {"bulge": (97, 77), "disk": (107, 87), "knots": (127, 95)}
-"""What the DC2 writers (of cosmoDC2, and of its predecessor) add to 1024 galaxy_id."""
-SHAPES = {"point": 0, "sersic2d": 4, "knots": 4}
-"""Numbers that follow a shape."""
+"""Codes that the DC2 writers (of cosmoDC2, and of its predecessor) add to 1024 galaxy_id, by component."""
+SHAPE_PARAMETERS = {"point": 0, "sersic2d": 4, "knots": 4}
+"""Number of parameters of each known shape."""
 NUMBERS = (
     "ra dec magnorm redshift gamma_1 gamma_2 kappa a b angle index internal_av internal_rv galactic_av galactic_rv"
 ).split()
-_LAWS = {"internal": ("ccm",), "galactic": ("ccm", "f99", "f19")}
+"""Numbers of an object; `index` is the Sersic index, or the number of knots."""
+_DUST_LAWS = {"internal": ("ccm",), "galactic": ("ccm", "f99", "f19")}
 
 
-@dataclass(frozen=True)
-class Text:
-    """What one pass over a text found."""
+@dataclass(frozen=True, kw_only=True)
+class TextSummary:
+    """Summary of a text file, from one pass over it."""
 
     size: int
-    """Bytes, unpacked."""
+    """Uncompressed size, bytes."""
     lines: tuple[int, ...]
     """Number of the first line that starts in each block."""
     rows: int
-    """Lines that are objects, or nothing that is known."""
+    """Number of rows: lines that are objects or that are not understood."""
     objects: int
+    """Number of object lines."""
     header: dict[str, float | int | str] = field(default_factory=dict)
+    """Header of the visit."""
     includes: tuple[str, ...] = ()
+    """Paths of the included files, as they are written in this file."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """An instance catalog with the files that it includes."""
+    """An instance catalog and the files that it includes."""
 
     paths: dict[str, AnyPath]
-    """By path relative to the catalog's folder."""
-    texts: dict[str, Text]
+    """Files, by their path relative to the folder of the catalog."""
+    texts: dict[str, TextSummary]
+    """Summary of each file, by the same keys."""
     block: int
-    """Bytes of a batch."""
+    """Bytes of uncompressed text per batch."""
     edges: tuple[float, ...] = ()
+    """Always empty: instance catalogs have no top-hat spectra."""
 
     def batches(self) -> tuple[Batch, ...]:
-        """Return the blocks of the texts, in bytes of the unpacked text."""
+        """Return the batches of all files: blocks of the uncompressed text, in bytes."""
         return tuple(
             Batch(self.paths[key], start, min(start + self.block, text.size), key)
             for key, text in self.texts.items()
@@ -73,39 +81,47 @@ class Source:
         )
 
     def count(self) -> int:
-        """Return the rows of all files: their object lines, and lines that are nothing known."""
+        """Return the number of rows of all files: object lines, and lines that are not understood."""
         return sum(text.rows for text in self.texts.values())
 
     def state(self) -> Any:
-        """Return bytes and times of all files."""
+        """Return the sizes and modification times of all files."""
         return {"files": file_states(self.paths)}
 
     def read(self, batch: Batch) -> pd.DataFrame:
-        """Return the rows of a batch in the normal form, one an object line; `merge_components` makes galaxies."""
-        data = _block(batch.path, batch.start, batch.stop)
+        """Return the rows of a batch in the normal form, one per object line.
+
+        The components of a galaxy are separate rows (see `romandask.ingest.rows.merge_components`).
+        """
+        lines = _lines_of_block(batch.path, batch.start, batch.stop)
         first = self.texts[batch.source].lines[batch.start // self.block]
-        rows = [(first + number, line) for number, line in enumerate(data) if _is_row(line)]
-        return _normal(batch.source, rows)
+        rows = [(first + number, line) for number, line in enumerate(lines) if _is_row(line)]
+        return _normal_form(batch.source, rows)
 
 
-def open_source(path: AnyPath, block: int = BLOCK) -> Source:
-    """Return an instance catalog; one pass over its text finds the included files, the lines and whether it is whole.
+def open_source(path: AnyPath, block: int = BLOCK_BYTES) -> Source:
+    """Open an instance catalog.
+
+    One pass over the text finds the included files, counts lines and rows, and checks that the files are complete.
 
     Parameters
     ----------
-    block : bytes of a batch
+    path : path
+        The catalog; included files are relative to its folder.
+    block : int
+        Bytes of uncompressed text per batch.
 
     Raises
     ------
     UserError
-        If it or an included file is missing, is not text, or is a damaged .gz; or if it holds no object.
+        If the catalog or an included file is missing, not text or a damaged .gz, or if there is no object.
     """
     paths, texts = {path.name: path}, {path.name: _scan(path, block)}
     for name in texts[path.name].includes:
         included = path.parent / name
         if not included.is_file():
             raise UserError(f"{path}: includes {name}, which is not beside it: copy it there")
-        # as imSim does, files that these include in turn are not read
+        # like imSim, read no files that are included by included files
         paths[Path(name).as_posix()], texts[Path(name).as_posix()] = included, _scan(included, block)
     source = Source(paths, texts, block)
     if not sum(text.objects for text in texts.values()):
@@ -114,58 +130,65 @@ def open_source(path: AnyPath, block: int = BLOCK) -> Source:
 
 
 def read_header(path: AnyPath) -> dict[str, float | int | str]:
-    """Return the header of a visit: its `key value` lines before the first object."""
+    """Return the header of the visit: the `key value` lines before the first object."""
     header: dict[str, float | int | str] = {}
-    for line in _lines(path):
+    for line in _iterate_lines(path):
         tokens = line.split()
         if tokens and tokens[0] == "object":
             break
         if len(tokens) == 2 and tokens[0] != "includeobj":
-            header[tokens[0]] = _value(tokens[1])
+            header[tokens[0]] = _parse_value(tokens[1])
     return header
 
 
-def _value(text: str) -> float | int | str:
-    for kind in (int, float):
+def _parse_value(text: str) -> float | int | str:
+    for number in (int, float):
         try:
-            return kind(text)
+            return number(text)
         except ValueError:
             continue
     return text
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line is an object, or nothing else that is known: header lines are `key value`."""
+    """Return whether a line is an object or is not understood: not blank, a comment, or a header line `key value`."""
     tokens = line.split(None, 2)
     return bool(tokens) and (tokens[0] == "object" or (len(tokens) != 2 and not tokens[0].startswith("#")))
 
 
-def _scan(path: AnyPath, block: int) -> Text:
-    """Return what a text holds, from one pass with a block in memory."""
-    size, lines, rows, objects, number = 0, [], 0, 0, 0
+def _scan(path: AnyPath, block: int) -> TextSummary:
+    """Return the summary of a text file, from one pass with one block in memory."""
+    size, lines, rows, objects, newlines = 0, [], 0, 0, 0
     includes: list[str] = []
     rest = b""
     try:
-        with _binary(path) as file:
+        with _open_binary(path) as file:
             while data := file.read(block):
-                if size == 0 and b"\0" in data[:LONGEST]:
+                if size == 0 and b"\0" in data[:MAX_LINE_BYTES]:
                     raise UserError(f"{path}: not text: an instance catalog is text or .gz")
-                starts = number + (0 if size == 0 or rest == b"" else 1)
-                lines.append(starts)
+                lines.append(newlines + (0 if size == 0 or rest == b"" else 1))
                 size += len(data)
-                number += data.count(b"\n")
-                whole, newline, tail = (rest + data).rpartition(b"\n")
-                found, known, named = _count(whole + newline)
-                rows, objects, includes, rest = rows + found, objects + known, includes + named, tail[-LONGEST:]
+                newlines += data.count(b"\n")
+                complete, newline, tail = (rest + data).rpartition(b"\n")
+                n_rows, n_objects, included = _count(complete + newline)
+                rows, objects, includes = rows + n_rows, objects + n_objects, includes + included
+                rest = tail[-MAX_LINE_BYTES:]
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: cannot be read ({reason}): copy it again") from None
-    found, known, named = _count(rest)
-    return Text(size, tuple(lines), rows + found, objects + known, read_header(path), tuple(includes + named))
+    n_rows, n_objects, included = _count(rest)
+    return TextSummary(
+        size=size,
+        lines=tuple(lines),
+        rows=rows + n_rows,
+        objects=objects + n_objects,
+        header=read_header(path),
+        includes=tuple(includes + included),
+    )
 
 
 def _count(text: bytes) -> tuple[int, int, list[str]]:
-    """Return the rows of whole lines, how many are objects, and the files that they include."""
+    """Return the number of rows and of objects in complete lines, and the files that they include."""
     objects = text.count(b"\nobject ") + text.startswith(b"object ")
     if objects == text.count(b"\n") + (not text.endswith(b"\n") and bool(text)):
         return objects, objects, []
@@ -180,33 +203,34 @@ def _count(text: bytes) -> tuple[int, int, list[str]]:
 
 
 def _decoded(data: bytes) -> list[str]:
-    """Return the lines of a text; only newlines end lines, whatever else it holds."""
+    """Return the lines of a text, which only newlines separate (str.splitlines accepts other characters as well)."""
     lines = data.decode("utf-8", "replace").split("\n")
     return lines if lines[-1] else lines[:-1]
 
 
-def _binary(path: AnyPath) -> Any:
+def _open_binary(path: AnyPath) -> Any:
+    """Open a file for reading; a .gz is recognised by its content and decompressed."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; truth.path must name an instance catalog below data")
-    here = local_copy(path)
-    with open(here, "rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    return gzip.open(here, "rb") if packed else open(here, "rb")
+    local = local_copy(path)
+    with open(local, "rb") as file:
+        compressed = file.read(2) == b"\x1f\x8b"
+    return gzip.open(local, "rb") if compressed else open(local, "rb")
 
 
-def _lines(path: AnyPath) -> Iterator[str]:
-    with _binary(path) as file:
-        while line := file.readline(LONGEST):
+def _iterate_lines(path: AnyPath) -> Iterator[str]:
+    with _open_binary(path) as file:
+        while line := file.readline(MAX_LINE_BYTES):
             yield line.decode("utf-8", "replace")
 
 
-def _block(path: AnyPath, start: int, stop: int) -> list[str]:
-    """Return the lines that start within bytes start..stop."""
+def _lines_of_block(path: AnyPath, start: int, stop: int) -> list[str]:
+    """Return the lines whose first byte is in the range from `start` to `stop` (exclusive)."""
     before = max(start - 1, 0)
-    # all of the line that runs out of the block, unless it is no line
-    data = _bytes(path, before, stop - before + LONGEST)
+    # read beyond the block, to the end of its last line
+    data = _bytes(path, before, stop - before + MAX_LINE_BYTES)
     if start > 0:
-        # the line that runs into the block belongs to the one before
+        # a line that starts before the block belongs to the previous block
         end = data.find(b"\n", 0, stop - before)
         if end < 0:
             return []
@@ -221,46 +245,51 @@ def _block(path: AnyPath, start: int, stop: int) -> list[str]:
 
 
 @dataclass
-class _Unpacker:
-    """A .gz that is read onwards, with the end of what was read."""
+class _GzipReader:
+    """An open .gz that is read sequentially; the end of the text read so far is kept, because blocks overlap."""
 
     key: tuple[AnyPath, int, int]
+    """Path, modification time (ns) and process."""
     file: BinaryIO
-    position: int = 0
+    offset: int = 0
+    """Offset of the next byte in the uncompressed text."""
     tail: bytes = b""
+    """Text before `offset`."""
 
     def read(self, start: int, length: int) -> bytes:
-        held = self.position - len(self.tail)
-        if not held <= start <= self.position:
+        tail_start = self.offset - len(self.tail)
+        if not tail_start <= start <= self.offset:
             self.file.seek(start)
-            self.position, self.tail, held = start, b"", start
-        kept = self.tail[start - held :]
+            self.offset, self.tail, tail_start = start, b"", start
+        kept = self.tail[start - tail_start :]
         data = kept + self.file.read(max(length - len(kept), 0))
-        self.position, self.tail = start + len(data), data[-2 * LONGEST :]
+        self.offset, self.tail = start + len(data), data[-2 * MAX_LINE_BYTES :]
         return data[:length]
 
 
-_LOCK = threading.Lock()
-_HELD: list[_Unpacker] = []
+_GZIP_LOCK = threading.Lock()
+_OPEN_GZIP: list[_GzipReader] = []
+"""The .gz that is open in this process, if any."""
 
 
 def _bytes(path: AnyPath, start: int, length: int) -> bytes:
-    """Return bytes of the unpacked text."""
-    with _binary(path) as file:
+    """Return a range of bytes of the uncompressed text."""
+    with _open_binary(path) as file:
         if not isinstance(file, gzip.GzipFile):
             file.seek(start)
             return file.read(length)
     key = (path, file_state(path)[1], os.getpid())
-    with _LOCK:
-        # one .gz stays open in a process: the next block then needs no unpacking from the beginning
-        if not _HELD or _HELD[0].key != key:
-            for held in _HELD:
-                held.file.close()
-            _HELD[:] = [_Unpacker(key, _binary(path))]
-        return _HELD[0].read(start, length)
+    with _GZIP_LOCK:
+        # one .gz stays open per process, so that the next block need not be decompressed from the beginning
+        if not _OPEN_GZIP or _OPEN_GZIP[0].key != key:
+            for reader in _OPEN_GZIP:
+                reader.file.close()
+            _OPEN_GZIP[:] = [_GzipReader(key, _open_binary(path))]
+        return _OPEN_GZIP[0].read(start, length)
 
 
-def _normal(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
+def _normal_form(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
+    """Return rows, given as line number and line, in the normal form."""
     parsed = [_parse(line) for _, line in rows]
     fields = list(zip(*parsed, strict=True)) if parsed else [()] * (len(NUMBERS) + 4)
     id_text, shape, sed, reason = (np.array(values, object) for values in fields[:4])
@@ -268,8 +297,8 @@ def _normal(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
     for name, texts in zip(NUMBERS, fields[4:], strict=True):
         text = pd.Series(texts, dtype=object)
         value[name] = pd.to_numeric(text, errors="coerce").to_numpy(float)
-        unread = np.flatnonzero(np.isnan(value[name]) & (reason == ""))
-        reason[[row for row in unread if texts[row].lower().lstrip("+-") != "nan"]] = f"{name} is not a number"
+        not_parsed = np.flatnonzero(np.isnan(value[name]) & (reason == ""))
+        reason[[row for row in not_parsed if texts[row].lower().lstrip("+-") != "nan"]] = f"{name} is not a number"
     point, knots = shape == "point", shape == "knots"
     sersic = shape == "sersic2d"
     index = value["index"]
@@ -278,7 +307,7 @@ def _normal(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
         reason[row] = f"Sersic index {index[row]:g} is neither 1 nor 4"
     reason[point & (value["redshift"] != 0) & (reason == "")] = "point source with a redshift is no star"
     reason[point & (value["internal_av"] != 0) & (reason == "")] = "point source with dust of its own is no star"
-    dark = value["magnorm"] >= DARK
+    dark = value["magnorm"] >= DARK_MAGNORM
     reason[point & dark & (reason == "")] = "magnorm of 50 or more: no light"
     magnorm = np.where(dark, np.inf, value["magnorm"])
     columns: dict[str, Any] = {
@@ -313,9 +342,9 @@ def _normal(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
 
 
 def _ids(texts: np.ndarray, component: dict[str, np.ndarray]) -> np.ndarray:
-    """Return identifiers; the components of a galaxy get that of the galaxy.
+    """Return identifiers; those of components of a galaxy are turned into the identifier of the galaxy.
 
-    They may be written 1024 galaxy_id + code, or galaxy_id_component as skyCatalogs does (translate_utils.py).
+    They may be written as 1024 galaxy_id + code, or as galaxy_id_component as skyCatalogs does (translate_utils.py).
     """
     ids = identifiers(texts, r"(-?\d{1,18})(?:_(?:bulge|disk|knots))?")
     for name, rows in component.items():
@@ -325,34 +354,34 @@ def _ids(texts: np.ndarray, component: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _parse(line: str) -> tuple[str, ...]:
-    """Return (id, shape, sed, reason, *NUMBERS) as texts; a reason where the line is not what it should be."""
+    """Return (id, shape, sed, reason, *NUMBERS) as texts, with a reason for quarantine if the line cannot be parsed."""
     tokens = line.split()
     if not tokens or tokens[0] != "object":
-        return _bad("", "line is neither a header, an includeobj nor an object")
+        return _rejected("", "line is neither a header, an includeobj nor an object")
     identifier = tokens[1] if len(tokens) > 1 else ""
     if len(tokens) < 13:
-        return _bad(identifier, f"too few fields ({len(tokens)})")
+        return _rejected(identifier, f"too few fields ({len(tokens)})")
     shape = tokens[12].lower()
-    if shape not in SHAPES:
-        return _bad(identifier, f"shape {tokens[12][:40]!r} is not known")
-    dust, place = [], 13 + SHAPES[shape]
-    for kind, laws in _LAWS.items():
-        law = tokens[place].lower() if place < len(tokens) else ""
+    if shape not in SHAPE_PARAMETERS:
+        return _rejected(identifier, f"shape {tokens[12][:40]!r} is not known")
+    dust, next_token = [], 13 + SHAPE_PARAMETERS[shape]
+    for kind, laws in _DUST_LAWS.items():
+        law = tokens[next_token].lower() if next_token < len(tokens) else ""
         if law == "none":
             dust += ["0", "3.1"]
-            place += 1
-        elif place + 2 < len(tokens):
+            next_token += 1
+        elif next_token + 2 < len(tokens):
             if law not in laws:
-                return _bad(identifier, f"law {tokens[place][:40]!r} of {kind} dust is not known")
-            dust += tokens[place + 1 : place + 3]
-            place += 3
+                return _rejected(identifier, f"law {tokens[next_token][:40]!r} of {kind} dust is not known")
+            dust += tokens[next_token + 1 : next_token + 3]
+            next_token += 3
         else:
-            return _bad(identifier, f"too few fields ({len(tokens)})")
-    if place != len(tokens):
-        return _bad(identifier, f"too many fields ({len(tokens)}, expected {place})")
-    form = tokens[13:17] if SHAPES[shape] else ["0"] * 4
-    return (identifier, shape, tokens[5], "", tokens[2], tokens[3], tokens[4], *tokens[6:10], *form, *dust)
+            return _rejected(identifier, f"too few fields ({len(tokens)})")
+    if next_token != len(tokens):
+        return _rejected(identifier, f"too many fields ({len(tokens)}, expected {next_token})")
+    shape_parameters = tokens[13:17] if SHAPE_PARAMETERS[shape] else ["0"] * 4
+    return (identifier, shape, tokens[5], "", tokens[2], tokens[3], tokens[4], *tokens[6:10], *shape_parameters, *dust)
 
 
-def _bad(identifier: str, reason: str) -> tuple[str, ...]:
+def _rejected(identifier: str, reason: str) -> tuple[str, ...]:
     return (identifier, "", "", reason, *["nan"] * len(NUMBERS))

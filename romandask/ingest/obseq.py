@@ -1,4 +1,4 @@
-"""Roman observing sequences: a FITS table of visits (date, exptime, ra, dec, pa, filter) in HDU 1."""
+"""Roman observing sequences: FITS files with a table of visits (date, exptime, ra, dec, pa, filter) in HDU 1."""
 
 from __future__ import annotations
 
@@ -16,21 +16,35 @@ from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, local_copy
 
 COLUMNS = ("date", "exptime", "ra", "dec", "pa", "filter")
-"""date is MJD; ra, dec and pa (degrees) are of the centre of the focal plane; the row index is the visit."""
+"""Columns of the table; the row index is the visit.
+
+`date` is in MJD and `exptime` in s; `ra`, `dec` and `pa` (degrees) refer to the centre of the focal plane.
+"""
 
 
 def read(path: AnyPath) -> pd.DataFrame:
-    """Return all visits: visit, band, mjd, exptime, ra, dec, pa; seeing, airmass and sky_brightness are NaN.
+    """Return all visits.
+
+    Parameters
+    ----------
+    path : path
+        FITS file.
+
+    Returns
+    -------
+    DataFrame
+        Columns visit, band, mjd, exptime (s), ra, dec and pa (degrees); seeing, airmass and sky_brightness are NaN.
 
     Raises
     ------
     UserError
-        If the file is missing, truncated or not FITS, lacks a column or holds a non-finite value.
+        If the file is missing, truncated or not FITS, lacks a column, or has a value that is not finite or is out of
+        range.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file; roman.pointings.path must name an observing sequence (FITS)")
     try:
-        # a truncated table is only a warning to astropy, and then a failure far from its cause
+        # astropy only warns of a truncated table, and fails later with an unrelated error
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyWarning)
             with fits.open(local_copy(path), memmap=False) as hdus:

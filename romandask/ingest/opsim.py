@@ -1,4 +1,4 @@
-"""Rubin's OpSim databases: SQLite, of every generation of the simulator."""
+"""OpSim databases (SQLite) of Rubin's survey simulators, of all generations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, local_copy
 
 TABLES = ("observations", "SummaryAllProps", "Summary")
-"""Newest first: the feature-based scheduler, OpSim 4 (2018-2021) and OpSim 3 (minion, kraken, enigma)."""
+"""Tables of visits, newest first: feature-based scheduler, OpSim 4 (2018-2021), OpSim 3 (minion, kraken, enigma)."""
 COLUMNS = {
     "visit": ("observationId", "obsHistID"),
     "band": ("band", "filter"),
@@ -26,27 +26,40 @@ COLUMNS = {
     "airmass": ("airmass",),
     "sky_brightness": ("skyBrightness", "filtSkyBrightness"),
 }
-"""Our columns and OpSim's, newest first; seeing is the atmosphere's FWHM at 500 nm and zenith, arcsec.
+"""Names in OpSim databases, newest first, of each of our columns.
 
-Of two filter columns `band` is a letter and `filter` the glass (r_57). OpSim 3's FWHMeff and finSeeing are those of the
-visit's band and airmass, its rawSeeing is at 500 nm and zenith.
+`seeing` is the FWHM of the atmosphere at 500 nm and zenith, arcsec. OpSim 3 has it in rawSeeing; its FWHMeff and
+finSeeing are for the band and airmass of the visit. If a database has both `band` and `filter`, the former is a letter
+and the latter a physical filter (r_57).
 """
 ANGLES = ("ra", "dec", "pa")
+"""Columns that OpSim 3 stores in radians."""
 
 
 def read(path: AnyPath) -> pd.DataFrame:
-    """Return all visits, by time; angles in degrees.
+    """Return all visits, sorted by time.
+
+    Parameters
+    ----------
+    path : path
+        SQLite database.
+
+    Returns
+    -------
+    DataFrame
+        The columns of `COLUMNS`; angles in degrees, exposure times in s, seeing in arcsec.
 
     Raises
     ------
     UserError
-        If the file is missing or is not an OpSim database, lacks a column or has missing values.
+        If the file is missing or not an OpSim database, lacks a column, has missing values or values out of range, or
+        if a visit number is not unique.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file; rubin.pointings.path must name an OpSim database (SQLite)")
     try:
         with closing(sqlite3.connect(f"{local_copy(path).resolve().as_uri()}?mode=ro", uri=True)) as connection:
-            table, names = _names(connection, path)
+            table, names = _table_and_columns(connection, path)
             columns = ", ".join(f'"{name}"' for name in names.values())
             visits = pd.read_sql_query(f'SELECT {columns} FROM "{table}"', connection)
     except (sqlite3.DatabaseError, pd.errors.DatabaseError):
@@ -62,29 +75,29 @@ def read(path: AnyPath) -> pd.DataFrame:
                 "remove these rows or simulate again"
             )
     if table == "Summary" and (visits[list(ANGLES)].abs().max() <= 2 * np.pi).all():
-        # OpSim 3 wrote radians; some copies were converted to degrees, which a survey's range of angles betrays
+        # OpSim 3 writes radians, but some copies were converted to degrees; the range of the angles shows which
         visits[list(ANGLES)] = np.degrees(visits[list(ANGLES)])
     check_ranges(visits, path, names)
     visits["band"] = visits["band"].astype(str).str.split("_").str[0]
-    # a visit that serves several proposals has a row for each
+    # a visit that belongs to several proposals has one row for each
     visits = visits.drop_duplicates(ignore_index=True)
-    again = visits["visit"][visits["visit"].duplicated()]
-    if len(again):
+    repeated = visits["visit"][visits["visit"].duplicated()]
+    if len(repeated):
         raise UserError(
-            f"{path}: table {table}, column {names['visit']!r}: {again.nunique()} numbers name several visits each, "
-            f"the first {again.iloc[0]}: number the visits uniquely"
+            f"{path}: table {table}, column {names['visit']!r}: {repeated.nunique()} numbers name several visits each, "
+            f"the first {repeated.iloc[0]}: number the visits uniquely"
         )
     return visits.sort_values(["mjd", "visit"], ignore_index=True)
 
 
-def _names(connection: sqlite3.Connection, path: AnyPath) -> tuple[str, dict[str, str]]:
-    """Return the table of visits and the names of its columns, by ours."""
-    found = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")]
-    tables = [name for name in TABLES if name.lower() in {other.lower() for other in found}]
+def _table_and_columns(connection: sqlite3.Connection, path: AnyPath) -> tuple[str, dict[str, str]]:
+    """Return the name of the table of visits, and the name of its column for each of our columns."""
+    existing = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")]
+    tables = [name for name in TABLES if name.lower() in {other.lower() for other in existing}]
     if not tables:
         raise UserError(
             f"{path}: holds no table {TABLES[0]!r}, {TABLES[1]!r} or {TABLES[2]!r} "
-            f"(found {', '.join(found) or 'none'}): not an OpSim database"
+            f"(found {', '.join(existing) or 'none'}): not an OpSim database"
         )
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({tables[0]})")]
     names = {}

@@ -1,9 +1,10 @@
-"""skyCatalogs (LSSTDESC): Parquet files a HEALPix pixel of galaxies and of stars, in its generations.
+"""skyCatalogs folders (LSSTDESC): their configuration, and their Parquet files, one per object type and HEALPix pixel.
 
-Galaxies: schema 1.1 to 1.3 (position angle; top-hat spectra), the schema from 1.5 on (ellipticities instead of the
-angle), an early one (`shear_2_phosim`, of opposite sign), and any with named spectra instead of top-hats. Stars:
-`pointsource` files (named spectra) and TRILEGAL files (effective temperature and magnitudes). The configuration holds
-the object types, their files' names and the top-hat bins; from 1.3 on it includes a file an object type.
+All generations are read. Galaxies have schema 1.1 to 1.3 (position angle; top-hat spectra), the schema from 1.5 on
+(ellipticities instead of the angle), or an early one (`shear_2_phosim`, of opposite sign); any of them may have named
+spectra instead of top-hat spectra. Stars are in `pointsource` files (named spectra) or TRILEGAL files (effective
+temperature and magnitudes). The configuration has the object types, the names of their files and the top-hat bins; from
+1.3 on it includes one file per object type.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import yaml
 from cdshealpix import from_ring
 
 from romandask.ingest import parquet
-from romandask.ingest.rows import COMPONENTS, FLUXES, MAX_ROWS, Batch, file_states, normal_form, with_reasons
+from romandask.ingest.rows import COMPONENTS, MAX_ROWS, Batch, file_states
+from romandask.ingest.skycatalogs_rows import MW_RV, PixelFile, check_columns, identifier_column, read_rows
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath
 
@@ -28,66 +29,31 @@ TEMPLATES = {
     "star": "(?:pointsource|star)_(?P<healpix>\\d+).parquet",
     "trilegal": "trilegal_(?P<healpix>\\d+).parquet",
 }
-"""Files by object type, where the configuration does not say."""
+"""File names of each kind of object if the configuration does not give them."""
 KINDS = {"galaxy": "galaxy", "star": "star", "trilegal": "trilegal", "trilegal_star": "trilegal"}
-"""Object types that are read; galaxies of diffsky have no spectra in their files, others vary or move."""
-NAMES = {
-    "redshift": ("redshift", "redshiftHubble", "redshift_hubble"),
-    "position_angle_unlensed": ("position_angle_unlensed", "position_angle_true"),
-}
-"""Names of other generations, in order of preference; elsewhere the normal form's own name."""
-SED_NAMES = ("{}_sed_file_path", "{}_sed_filepath", "{}_sed_file")
-ELLIPTICITIES = tuple(f"ellipticity_{i}_{c}_true" for c in ("disk", "bulge") for i in (1, 2))
-PLAIN = tuple(
-    (
-        "ra dec redshift shear_1 convergence size_bulge_true size_minor_bulge_true size_disk_true size_minor_disk_true "
-        "bulge_magnorm disk_magnorm MW_av"
-    ).split()
-)
-STAR_COLUMNS = tuple("id ra dec magnorm sed_filepath MW_av".split())
-TRILEGAL_COLUMNS = tuple("id ra dec av logT".split())
-PLAIN_ID = r"(-?\d{1,18})"
-TRILEGAL_ID = r".*_hp(?:\d+)_(\d{1,12})"
-"""TRILEGAL ids are texts, <source>_hp<pixel>_<number in the pixel>."""
-MW_RV = 3.1
+"""Kind of object of each object type that is read. Galaxies of diffsky have no spectra in their files; the objects of
+other types vary or move."""
 TOPHAT_ROWS = 100_000
-"""Rows of a batch of galaxies with top-hat spectra at most: some 300 MB while it is read."""
+"""Largest number of rows of a batch of galaxies with top-hat spectra: reading it takes some 300 MB."""
 
 
-@dataclass(frozen=True)
-class File:
-    """A file of one HEALPix pixel."""
-
-    path: AnyPath
-    kind: str
-    """galaxy, star or trilegal"""
-    order: int
-    """HEALPix order of the pixel."""
-    cell: int
-    """The pixel, nested."""
-    pixel: int
-    """The pixel as the file's name has it."""
-    flux: AnyPath | None
-    """File of Rubin fluxes of the same objects."""
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Source:
     """A folder of skyCatalogs files."""
 
-    files: dict[str, File]
-    """By name."""
+    files: dict[str, PixelFile]
+    """Files with objects, by name."""
     edges: tuple[float, ...]
-    """Rest-frame edges of the top-hat bins, nm; empty where no file has top-hat spectra."""
+    """Rest-frame edges of the bins of top-hat spectra, nm; empty if no file has top-hat spectra."""
     mw_rv: float
-    """R_V of the Milky Way where a file has no such column."""
+    """R_V of the Milky Way for files that have no column for it."""
     rows: int
-    """Most rows of a batch."""
+    """Largest number of rows of a batch."""
     ignored: tuple[str, ...]
     """Object types of the configuration that are not read."""
 
     def batches(self) -> tuple[Batch, ...]:
-        """Return slices of the files."""
+        """Return the batches of all files."""
         rows = {"galaxy": min(self.rows, TOPHAT_ROWS) if self.edges else self.rows}
         return tuple(
             batch
@@ -96,57 +62,51 @@ class Source:
         )
 
     def cell(self, batch: Batch) -> tuple[int, int]:
-        """Return HEALPix order and nested cell of a batch's file; lensing moves some of its objects to neighbours."""
+        """Return the HEALPix order and the nested pixel of the file of a batch.
+
+        Lensing moves some of its objects to neighbouring pixels.
+        """
         file = self.files[batch.source]
         return file.order, file.cell
 
     def count(self) -> int:
-        """Return the rows of all files, from their footers."""
+        """Return the number of rows of all files, from their footers."""
         return sum(parquet.count(file.path) for file in self.files.values())
 
     def state(self) -> Any:
-        """Return bytes and times of all files, and what the configuration says."""
+        """Return the sizes and modification times of all files, and the settings of the configuration."""
         fluxes = {file.flux.name: file.flux for file in self.files.values() if file.flux}
         paths = {name: file.path for name, file in self.files.items()} | fluxes
         return {"files": file_states(paths), "edges": list(self.edges), "mw_rv": self.mw_rv}
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
-        file = self.files[batch.source]
-        schema = parquet.schema(file.path)
-        reader = {"galaxy": _galaxies, "star": _stars, "trilegal": _trilegal}[file.kind]
-        columns = reader(schema.names, batch, file, self.mw_rv)
-        id_name, pattern = _identifier(file)
-        repeated = parquet.repeated(batch, id_name, pattern)
-        if file.flux:
-            columns |= _fluxes(file, batch, columns["id"])
-        kind = "galaxy" if file.kind == "galaxy" else "star"
-        columns["id"] = _shifted(file, columns["id"])
-        frame = normal_form(batch.source, np.arange(batch.start, batch.stop), kind, columns)
-        return with_reasons(frame, len(self.edges) - 1, repeated)
+        return read_rows(batch, self.files[batch.source], self.mw_rv, len(self.edges) - 1)
 
 
 def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
-    """Return the files of a folder, their columns checked.
+    """Open a folder of skyCatalogs files and check their columns.
 
     Parameters
     ----------
-    folder : the folder, or a configuration file in it where it has several
-    rows : most rows of a batch
+    folder : path
+        The folder, or one of the configuration files in it if there are several.
+    rows : int
+        Largest number of rows of a batch.
 
     Raises
     ------
     UserError
-        If the folder, its configuration or a column is missing, or a file is not Parquet.
+        If the folder, its configuration or a column is missing, or if a file is not Parquet.
     """
-    config, folder = _configuration(folder)
+    config, folder = _configuration_file(folder)
     content = _read_config(config, folder)
     types = content.get("object_types")
     if types is None:
         types = {name: {} for name in TEMPLATES}
     if not isinstance(types, dict):
         raise UserError(f"{config}: key object_types holds {type(types).__name__}, expected a mapping of object types")
-    files: dict[str, File] = {}
+    files: dict[str, PixelFile] = {}
     for name, section in types.items():
         if name in KINDS:
             files |= _files(folder, config, name, section if isinstance(section, dict) else {}, content)
@@ -158,19 +118,20 @@ def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
     tophat = False
     for file in files.values():
         names = parquet.schema(file.path).names
-        _check(file, names)
+        check_columns(file, names)
         tophat |= any(f"sed_val_{c}" in names for c in COMPONENTS)
-        if file.flux and _identifier(file)[0] not in parquet.schema(file.flux).names:
-            raise UserError(f"{file.flux}: column {_identifier(file)[0]!r} is missing")
+        if file.flux and identifier_column(file)[0] not in parquet.schema(file.flux).names:
+            raise UserError(f"{file.flux}: column {identifier_column(file)[0]!r} is missing")
     try:
         mw_rv = float(content["MW_extinction_values"]["r_v"]["value"])
     except (KeyError, TypeError, ValueError):
         mw_rv = MW_RV
-    return Source(files, _edges(config, content) if tophat else (), mw_rv, rows, ignored)
+    edges = _tophat_edges(config, content) if tophat else ()
+    return Source(files=files, edges=edges, mw_rv=mw_rv, rows=rows, ignored=ignored)
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML with `!include file`, files below one folder."""
+    """A safe YAML loader with `!include file`, for files below one folder."""
 
     folder: AnyPath
     depth: int
@@ -186,6 +147,7 @@ _Loader.add_constructor("!include", _Loader.include)
 
 
 def _read_config(path: AnyPath, folder: AnyPath, depth: int = 0) -> dict[str, Any]:
+    """Return the content of a configuration file; `depth` counts nested includes."""
     try:
         loader = _Loader(path.read_text())
         loader.folder, loader.depth = folder, depth
@@ -201,7 +163,8 @@ def _read_config(path: AnyPath, folder: AnyPath, depth: int = 0) -> dict[str, An
     return content
 
 
-def _configuration(folder: AnyPath) -> tuple[AnyPath, AnyPath]:
+def _configuration_file(folder: AnyPath) -> tuple[AnyPath, AnyPath]:
+    """Return the configuration file and the folder; `folder` may be either."""
     if folder.is_file():
         return folder, folder.parent
     if not folder.is_dir():
@@ -209,22 +172,25 @@ def _configuration(folder: AnyPath) -> tuple[AnyPath, AnyPath]:
     usual = folder / "skyCatalog.yaml"
     if usual.is_file():
         return usual, folder
-    found = [path for path in sorted(folder.glob("*.yaml")) if re.search(r"(?m)^object_types\s*:", path.read_text())]
-    if not found:
+    paths = [path for path in sorted(folder.glob("*.yaml")) if re.search(r"(?m)^object_types\s*:", path.read_text())]
+    if not paths:
         raise UserError(f"{folder}: holds no skyCatalog.yaml: not a skyCatalogs folder")
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
+    if len(paths) > 1:
+        names = ", ".join(path.name for path in paths)
         raise UserError(f"{folder}: holds several configurations ({names}): name one of them instead of the folder")
-    return found[0], folder
+    return paths[0], folder
 
 
-def _edges(config: AnyPath, content: dict[str, Any]) -> tuple[float, ...]:
-    """Return the edges of the top-hat bins; until schema 1.2 under SED_models, later under the galaxies."""
-    for place in (content.get("SED_models"), (content.get("object_types") or {}).get("galaxy")):
-        if isinstance(place, dict) and "tophat" in place:
+def _tophat_edges(config: AnyPath, content: dict[str, Any]) -> tuple[float, ...]:
+    """Return the edges of the top-hat bins, nm.
+
+    Until schema 1.2 the configuration has them under SED_models, later under the object type of galaxies.
+    """
+    for section in (content.get("SED_models"), (content.get("object_types") or {}).get("galaxy")):
+        if isinstance(section, dict) and "tophat" in section:
             try:
-                bins = [(float(start), float(width)) for start, width in place["tophat"]["bins"]]
-                factor = {"angstrom": 0.1, "nm": 1.0}[place["tophat"]["units"]]
+                bins = [(float(start), float(width)) for start, width in section["tophat"]["bins"]]
+                factor = {"angstrom": 0.1, "nm": 1.0}[section["tophat"]["units"]]
                 edges = tuple(factor * start for start, _ in bins) + (factor * sum(bins[-1]),)
             except (KeyError, TypeError, ValueError, IndexError):
                 break
@@ -234,7 +200,8 @@ def _edges(config: AnyPath, content: dict[str, Any]) -> tuple[float, ...]:
     raise UserError(f"{config}: key SED_models.tophat (bins, units) is missing or not as skyCatalogs writes it")
 
 
-def _files(folder: AnyPath, config: AnyPath, name: str, section: Any, content: dict[str, Any]) -> dict[str, File]:
+def _files(folder: AnyPath, config: AnyPath, name: str, section: Any, content: dict[str, Any]) -> dict[str, PixelFile]:
+    """Return the files of an object type, by name; `section` is its part of the configuration `content`."""
     kind = KINDS[name]
     template = section.get("file_template", TEMPLATES[kind].replace("trilegal", name))
     partition = section.get("area_partition") or content.get("area_partition") or {}
@@ -242,14 +209,14 @@ def _files(folder: AnyPath, config: AnyPath, name: str, section: Any, content: d
     if not isinstance(nside, int) or nside < 1 or nside & (nside - 1) or ordering not in ("ring", "nested", "nest"):
         raise UserError(f"{config}: area_partition has nside {nside}, ordering {ordering}: expected a power of 2, ring")
     order = nside.bit_length() - 1
-    fluxes = section.get("flux_file_template", template.replace("_(", "_flux_(", 1))
+    flux_template = section.get("flux_file_template", template.replace("_(", "_flux_(", 1))
     try:
-        pattern, flux_pattern = re.compile(template), re.compile(fluxes)
+        pattern, flux_pattern = re.compile(template), re.compile(flux_template)
     except (re.error, TypeError):
         raise UserError(f"{config}: file_template of {name} is not a regular expression: {template}") from None
     if "healpix" not in pattern.groupindex or "healpix" not in flux_pattern.groupindex:
         raise UserError(f"{config}: file_template of {name} has no (?P<healpix>...): {template}")
-    files: dict[str, File] = {}
+    files: dict[str, PixelFile] = {}
     flux_paths = {}
     for path in sorted(folder.iterdir()):
         if match := flux_pattern.fullmatch(path.name):
@@ -260,147 +227,6 @@ def _files(folder: AnyPath, config: AnyPath, name: str, section: Any, content: d
             if pixel >= 12 * nside**2:
                 raise UserError(f"{path}: {pixel} is not a HEALPix pixel of nside {nside}")
             cell = int(from_ring(np.array([pixel], np.uint64), order)[0]) if ordering == "ring" else pixel
-            files[path.name] = File(path, kind, order, cell, pixel, flux_paths.get(match["healpix"]))
+            flux = flux_paths.get(match["healpix"])
+            files[path.name] = PixelFile(path=path, kind=kind, order=order, cell=cell, pixel=pixel, flux=flux)
     return files
-
-
-def _check(file: File, names: list[str]) -> None:
-    needed: list[tuple[str, ...]]
-    if file.kind == "star":
-        needed = [(name,) for name in STAR_COLUMNS]
-    elif file.kind == "trilegal":
-        needed = [(name,) for name in TRILEGAL_COLUMNS] + [tuple(f"{band}mag" for band in "irgzyu")]
-    else:
-        needed = [("galaxy_id",)] + [NAMES.get(name, (name,)) for name in PLAIN] + [("shear_2", "shear_2_phosim")]
-        if not set(ELLIPTICITIES) <= set(names):
-            needed.append(NAMES["position_angle_unlensed"])
-        needed += [(f"sed_val_{c}", *(n.format(c) for n in SED_NAMES)) for c in ("bulge", "disk")]
-        if "knots_magnorm" in names:
-            needed.append(("n_knots",))
-    for choices in needed:
-        if not set(choices) & set(names):
-            raise UserError(f"{file.path}: column {choices[0]!r} is missing (found {', '.join(names)})")
-
-
-def _first(names: list[str], *choices: str) -> str | None:
-    return next((name for name in choices if name in names), None)
-
-
-def _galaxies(names: list[str], batch: Batch, file: File, mw_rv: float) -> dict[str, Any]:
-    plain = {name: str(_first(names, *NAMES.get(name, (name,)))) for name in PLAIN}
-    plain |= {name: name for name in ("shear_2", "MW_rv", "knots_magnorm", "n_knots") if name in names}
-    plain |= {name: name for name in ("shear_2_phosim", "sersic_bulge", "sersic_disk") if name in names}
-    if angle := _first(names, *NAMES["position_angle_unlensed"]):
-        plain["position_angle_unlensed"] = angle
-    else:
-        plain |= {name: name for name in ELLIPTICITIES}
-    lists = {c: f"sed_val_{c}" for c in COMPONENTS if f"sed_val_{c}" in names}
-    named = {c: _first(names, *(n.format(c) for n in SED_NAMES)) for c in COMPONENTS if c not in lists}
-    # knots have the spectrum of the disk
-    named = {c: name or named.get("disk") for c, name in named.items()}
-    wanted = {"galaxy_id", *plain.values(), *lists.values(), *(name for name in named.values() if name)}
-    table = parquet.read(batch.path, sorted(wanted), batch.start, batch.stop)
-    out: dict[str, Any] = {name: parquet.numbers(table[column]) for name, column in plain.items()}
-    out["id"] = parquet.integers(table["galaxy_id"], PLAIN_ID)
-    out |= {f"sed_val_{c}": parquet.bins(table[name]) for c, name in lists.items()}
-    out |= {f"{c}_sed": parquet.texts(table[name]) for c, name in named.items() if name}
-    if "shear_2" not in out:
-        # GCR: shear_2_phosim = -shear_2
-        out["shear_2"] = -out["shear_2_phosim"]
-    reason = np.full(len(table), "", object)
-    for component, index in (("bulge", 4), ("disk", 1)):
-        if (name := f"sersic_{component}") in out:
-            odd = np.isfinite(out[f"{component}_magnorm"]) & (out[name] != index)
-            reason[odd & (reason == "")] = f"Sersic index of the {component} is not {index}"
-    if "position_angle_unlensed" not in out:
-        out["position_angle_unlensed"], twisted = _position_angle(out)
-        reason[twisted & (reason == "")] = "bulge and disk differ in position angle"
-    out.setdefault("MW_rv", np.full(len(table), mw_rv))
-    # the top-hat spectra of cosmoDC2 hold the galaxies' own dust; files with named spectra tell of none
-    return out | {"reason": reason, "bulge_av": 0.0, "bulge_rv": MW_RV, "disk_av": 0.0, "disk_rv": MW_RV}
-
-
-def _position_angle(out: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return degrees east of north from ellipticities, and where bulge and disk differ by more than a degree.
-
-    skyCatalogs draws Shear(-e1, -e2), the direction 90 deg + p of a position angle p (galaxy_object.py).
-    """
-    e1d, e2d, e1b, e2b = (out[name] for name in ELLIPTICITIES)
-    disk, bulge = (np.degrees(np.arctan2(e2, e1)) / 2 % 180 for e1, e2 in ((e1d, e2d), (e1b, e2b)))
-    lit = {c: np.isfinite(out[f"{c}_magnorm"]) for c in ("bulge", "disk")}
-    flat = (np.hypot(e1d, e2d) > 0.01) & (np.hypot(e1b, e2b) > 0.01)
-    twisted = lit["bulge"] & lit["disk"] & flat & (np.abs((disk - bulge + 90) % 180 - 90) > 1)
-    return np.where(lit["bulge"] & ~lit["disk"] & ~np.isfinite(out.get("knots_magnorm", np.nan)), bulge, disk), twisted
-
-
-def _stars(names: list[str], batch: Batch, file: File, mw_rv: float) -> dict[str, Any]:
-    wanted = [*STAR_COLUMNS, *(name for name in ("object_type", "MW_rv") if name in names)]
-    table = parquet.read(batch.path, wanted, batch.start, batch.stop)
-    out: dict[str, Any] = {name: parquet.numbers(table[name]) for name in ("ra", "dec", "magnorm", "MW_av")}
-    out["id"] = parquet.integers(table["id"], PLAIN_ID)
-    out["sed"] = parquet.texts(table["sed_filepath"])
-    out["MW_rv"] = parquet.numbers(table["MW_rv"]) if "MW_rv" in names else np.full(len(table), mw_rv)
-    reason = np.full(len(table), "", object)
-    if "object_type" in names:
-        reason[parquet.texts(table["object_type"]) != "star"] = "object_type is not star"
-    return out | {"reason": reason}
-
-
-def _trilegal(names: list[str], batch: Batch, file: File, mw_rv: float) -> dict[str, Any]:
-    band = next(band for band in "irgzyu" if f"{band}mag" in names)
-    table = parquet.read(batch.path, [*TRILEGAL_COLUMNS, f"{band}mag"], batch.start, batch.stop)
-    out: dict[str, Any] = {name: parquet.numbers(table[name]) for name in ("ra", "dec")}
-    out["id"] = parquet.integers(table["id"], TRILEGAL_ID)
-    with np.errstate(over="ignore"):
-        kelvin = 10 ** parquet.numbers(table["logT"])
-    good = (kelvin >= 500) & (kelvin < 1e6)
-    rounded = (np.round(np.where(good, kelvin, 5000) / 100) * 100).astype(int)
-    out["sed"] = np.array([f"blackbody_{value}" for value in rounded], object)
-    return out | {
-        # skyCatalogs scales the spectrum to imag after extinction (trilegal_object.py)
-        "ref_mag": parquet.numbers(table[f"{band}mag"]),
-        "ref_band": f"lsst_{band}",
-        "MW_av": parquet.numbers(table["av"]),
-        "MW_rv": MW_RV,
-        "reason": np.where(good, "", "effective temperature is not a number").astype(object),
-    }
-
-
-def _identifier(file: File) -> tuple[str, str]:
-    if file.kind == "galaxy":
-        return "galaxy_id", PLAIN_ID
-    return "id", TRILEGAL_ID if file.kind == "trilegal" else PLAIN_ID
-
-
-def _shifted(file: File, ids: np.ndarray) -> np.ndarray:
-    """Return ids that are unique over files: TRILEGAL numbers its stars within a pixel."""
-    if file.kind != "trilegal":
-        return ids
-    return np.where(ids < 0, ids, ids + ((file.pixel + 1) << 40))
-
-
-def _fluxes(file: File, batch: Batch, ids: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the fluxes of a batch's objects, joined by id: mostly the same rows of the flux file, else wherever."""
-    path = file.flux
-    assert path is not None
-    column, pattern = _identifier(file)
-    names = [name for name in FLUXES if name in parquet.schema(path).names]
-    total = parquet.count(path)
-
-    def take(start: int, stop: int) -> pd.DataFrame:
-        table: pa.Table = parquet.read(path, [column, *names], start, stop)
-        values = {name: parquet.numbers(table[name]).astype(np.float32) for name in names}
-        index = parquet.integers(table[column], pattern)
-        return pd.DataFrame(values, index=index).loc[~pd.Index(index).duplicated() & (index >= 0)]
-
-    same = take(batch.start, min(batch.stop, total))
-    found = same.reindex(ids)
-    missing = (ids >= 0) & ~np.isin(ids, same.index)
-    for start in range(0, total, MAX_ROWS) if missing.any() else ():
-        part = take(start, min(start + MAX_ROWS, total))
-        here = missing & np.isin(ids, part.index)
-        found.iloc[np.flatnonzero(here)] = part.reindex(ids[here]).to_numpy()
-        missing &= ~here
-        if not missing.any():
-            break
-    return {name: found[name].to_numpy() for name in names}

@@ -1,4 +1,4 @@
-"""Spectra from files: GalSim's CWW templates, blackbodies, and folders of text spectra (nm, f_lambda)."""
+"""Libraries of spectra: GalSim's CWW templates, blackbodies, and folders of text files (nm, f_lambda)."""
 
 from __future__ import annotations
 
@@ -16,21 +16,34 @@ from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
 from romandask.storage.paths import AnyPath, local_copy
 
 BLACKBODY = re.compile(r"blackbody_(\d{3,6})")
-YOUNG = "flat_fnu"
-"""Name of a spectrum of constant f_nu above the Lyman limit: the bluest galaxies (UV slope -2, Bouwens et al. 2009),
-which Coleman, Wu and Weedman's templates do not reach."""
+"""Names of blackbodies; the number is the temperature, K."""
+FLAT_FNU = "flat_fnu"
+"""Name of the spectrum with constant f_nu above the Lyman limit.
+
+It stands for the bluest galaxies (UV slope -2, Bouwens et al. 2009), which are bluer than all templates of Coleman, Wu
+and Weedman.
+"""
 _LYMAN_LIMIT = 91.2
+"""Wavelength, nm."""
 
 
 def galaxy_templates(names: tuple[str, ...], steps: int) -> SpectrumLibrary:
-    """Return GalSim's galaxy templates (Coleman, Wu and Weedman 1980, extended) and YOUNG, and blends of neighbours.
+    """Return galaxy templates and blends of neighbouring templates.
 
-    From each template to the next are `steps` spectra; blends are linear in photons, both normalised at 500 nm.
+    The templates are GalSim's (Coleman, Wu and Weedman 1980, extended) and `FLAT_FNU`. Blends are linear in photons,
+    with both templates normalised at 500 nm.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the templates, in the order in which neighbours are blended.
+    steps : int
+        Number of steps from each template to the next, with `steps` - 1 blends between them.
     """
     grid = default_grid()
     spectra = []
     for name in names:
-        if name == YOUNG:
+        if name == FLAT_FNU:
             spectra.append((grid, np.where(grid > _LYMAN_LIMIT, grid**-2.0, 0.0)))
             continue
         angstrom, flambda = np.loadtxt(Path(galsim.meta_data.share_dir) / "SEDs" / f"{name}_ext_more.sed", unpack=True)
@@ -38,16 +51,16 @@ def galaxy_templates(names: tuple[str, ...], steps: int) -> SpectrumLibrary:
     pure = library_from(list(names), spectra, grid)
     labels, rows = [], []
     for k in range((len(names) - 1) * steps + 1):
-        one, share = divmod(k, steps)
-        labels.append(names[one] if share == 0 else f"{names[one]}+{share}/{steps}")
-        two = min(one + 1, len(names) - 1)
-        rows.append(pure.photons[one] * (1 - share / steps) + pure.photons[two] * (share / steps))
+        first, step = divmod(k, steps)
+        labels.append(names[first] if step == 0 else f"{names[first]}+{step}/{steps}")
+        second = min(first + 1, len(names) - 1)
+        rows.append(pure.photons[first] * (1 - step / steps) + pure.photons[second] * (step / steps))
     limits = np.tile([grid[0], grid[-1]], (len(rows), 1))
     return SpectrumLibrary(tuple(labels), grid, np.array(rows), limits)
 
 
 def blackbodies(temperatures: tuple[int, ...]) -> SpectrumLibrary:
-    """Return blackbodies, named blackbody_<K>."""
+    """Return blackbodies of the given temperatures, K, named blackbody_<K>."""
     grid = default_grid()
     scale = 1 * u.erg / (u.s * u.cm**2 * u.AA * u.sr)
     spectra = [(grid, BlackBody(value * u.K, scale=scale)(grid * u.nm).value) for value in temperatures]
@@ -55,7 +68,7 @@ def blackbodies(temperatures: tuple[int, ...]) -> SpectrumLibrary:
 
 
 def joined(*libraries: SpectrumLibrary) -> SpectrumLibrary:
-    """Return one library of several on the same grid."""
+    """Return one library with the spectra of several, which must have the same wavelength grid."""
     return SpectrumLibrary(
         tuple(name for library in libraries for name in library.names),
         libraries[0].wave,
@@ -65,24 +78,48 @@ def joined(*libraries: SpectrumLibrary) -> SpectrumLibrary:
 
 
 def every_file(folder: AnyPath) -> list[str]:
-    """Return the files of a folder of spectra, by their paths below it."""
+    """Return the paths of all files below a folder of spectra, relative to it.
+
+    Raises
+    ------
+    UserError
+        If there is no such folder.
+    """
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder of spectra")
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
 def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
-    """Return a library of the named spectra (paths below the folder) and, by name, why others are not in it.
+    """Return a library of the spectra with the given names.
 
-    blackbody_<K> is a blackbody of that temperature and needs no file.
+    Parameters
+    ----------
+    folder : path
+        Folder of text files, plain or .gz, with the columns wavelength (nm) and f_lambda.
+    names : list of str
+        Paths of files relative to the folder, or blackbody_<K> for a blackbody of that temperature, which needs no
+        file.
+
+    Returns
+    -------
+    library : SpectrumLibrary
+        The spectra that could be read.
+    reasons : dict
+        Why a spectrum could not be read, by name.
+
+    Raises
+    ------
+    UserError
+        If there is no such folder and a name is not that of a blackbody.
     """
     if not folder.is_dir() and any(not BLACKBODY.fullmatch(name) for name in names):
         raise UserError(f"{folder}: no such folder; truth.seds must name the folder of spectra")
-    found, spectra, reasons = [], [], {}
+    labels, spectra, reasons = [], [], {}
     grid = default_grid()
     for name in sorted(set(names)):
         if match := BLACKBODY.fullmatch(name):
-            found.append(name)
+            labels.append(name)
             spectra.append((grid, blackbodies((int(match.group(1)),)).photons[0] / grid))
             continue
         path = (folder / name).resolve()
@@ -93,13 +130,13 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
             reasons[name] = "SED not in the library"
             continue
         try:
-            here = local_copy(path)
-            with gzip.open(here, "rt") if here.suffix == ".gz" else open(here) as file:
+            local = local_copy(path)
+            with gzip.open(local, "rt") if local.suffix == ".gz" else open(local) as file:
                 wave, flambda = np.loadtxt(file, unpack=True)[:2]
             library_from([name], [(wave, flambda)], np.array([400.0, 500.0]))
         except (OSError, EOFError, ValueError):
             reasons[name] = "SED file cannot be read"
             continue
-        found.append(name)
+        labels.append(name)
         spectra.append((wave, flambda))
-    return library_from(found, spectra, grid), reasons
+    return library_from(labels, spectra, grid), reasons

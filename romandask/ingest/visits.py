@@ -1,4 +1,4 @@
-"""What every table of visits must be, wherever it comes from."""
+"""Checks of tables of visits that apply to every input format."""
 
 from __future__ import annotations
 
@@ -14,21 +14,25 @@ RANGES = {
     "seeing": (0.05, 20.0),
     "airmass": (1.0, 40.0),
 }
-"""Of our columns: what is beyond them is in other units, or no visit."""
+"""Valid range of each column, degrees, s or arcsec. A value outside is in other units or does not describe a visit."""
 
 
 def check_ranges(visits: pd.DataFrame, path: AnyPath, names: dict[str, str]) -> None:
-    """Check that every visit points at the sky for some time.
+    """Check that the columns of a table of visits are within their valid ranges.
 
     Parameters
     ----------
-    visits : columns of RANGES, those that there are; degrees, seconds, arcsec
-    names : by column of ours the file's
+    visits : DataFrame
+        Visits; columns of `RANGES` that are missing, and missing values, are not checked.
+    path : path
+        File that the visits were read from, for the error message.
+    names : dict
+        Column of the file, by our column; a column that is not in it has the same name in the file.
 
     Raises
     ------
     UserError
-        Naming the file, its column and the first value that is wrong.
+        If a value is out of range; names the file, its column and the first such value.
     """
     for name, (low, high) in RANGES.items():
         if name not in visits:

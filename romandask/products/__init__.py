@@ -1,1 +1,1 @@
-"""Lazy products over units: images and tables, read where they are stored and made where they are not."""
+"""Lazy products over units: images and tables, read from the store if they are stored, otherwise made."""

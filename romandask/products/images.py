@@ -1,4 +1,4 @@
-"""Image products: lazy images over units, each read from the store where it is and made where it is not."""
+"""Image products: lazy images over units, each read from the store if it is stored, otherwise made."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from romandask.products.tables import conform, to_frame
 from romandask.products.units import Made, Unit, names_of
 from romandask.storage.arrays import (
     Variable,
-    few_chunks,
+    limited_concurrency,
     open_images,
     read_group,
     write_array,
@@ -33,40 +33,47 @@ from romandask.storage.manifest import digest, read_record
 from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store, read_parquet, write_parquet
 
-NOTHING: Mapping[str, bytes] = MappingProxyType({})
+_NO_TABLES: Mapping[str, bytes] = MappingProxyType({})
 Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
-"""By name: axes, values, attributes."""
+"""Axes, values and attributes of each coordinate, by name."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class ImageProduct:
-    """Images over units; `dataset` is the lazy xarray view."""
+    """Images over units. `dataset` is the lazy xarray view."""
 
     stage: str
-    """For example exposures/roman; also its place in the store."""
+    """Name of the stage, for example exposures/roman; also the path of the product in the store."""
     units: Sequence[Unit]
+    """Units of the product, in C order along `axes`."""
     make: Callable[[int], dict[str, Any]]
-    """Makes the arrays of one unit; one may be a function of no arguments, which makes it when it is wanted."""
+    """Makes the arrays of the unit with a given index, by name.
+
+    An array may be given as a function without arguments that returns it; it is called when the array is needed.
+    """
     variables: tuple[Variable, ...]
+    """Arrays of the product."""
     axes: tuple[str, ...]
     """Names of the axes over units."""
     lengths: tuple[int, ...]
-    """Their lengths; units are in C order."""
+    """Number of units along each of `axes`."""
     coordinates: Callable[[], Coordinates]
-    """Values along the axes; asked for only when images are, for headers of many exposures take their time."""
+    """Returns the coordinates; called only when they are needed, because the headers of many exposures take time."""
     attributes: dict[str, Any] = field(default_factory=dict)
+    """Attributes of the Zarr group and of `dataset`."""
     bytes_per_unit: int = 0
-    """Peak memory, bytes, of making one unit beyond the interpreter."""
+    """Peak memory of making one unit, bytes, in addition to what a worker holds between units."""
     seconds_per_unit: float = 0.0
-    """Time, seconds of a core as measured on a laptop, of making one unit: for plans."""
+    """Time to make one unit on one core of a laptop, s; used for planning."""
     store: Store | None = None
+    """Store that stored units are read from; without one, every unit is made."""
     stream: Callable[[int], Iterator[tuple[str, np.ndarray]]] | None = None
-    """Makes the arrays of one unit one after another, where all at once would not fit a worker."""
+    """Makes the arrays of a unit one after another, for units that do not fit the memory of a worker as a whole."""
     tables: dict[str, pa.Schema] = field(default_factory=dict)
-    """Tables that `make` returns beside the arrays of a unit, of any number of rows."""
+    """Schemas, by name, of tables that `make` returns in addition to the arrays; they may have any number of rows."""
 
     def __repr__(self) -> str:
-        # what makes it holds the products that it reads, and those theirs
+        # the generated repr would include `make`, and through it all upstream products
         return f"ImageProduct({self.stage}, {len(self.units)} units)"
 
     @cached_property
@@ -80,54 +87,71 @@ class ImageProduct:
         return self
 
     def stored(self, store: Store) -> ImageProduct:
-        """Return the same product, reading what the store has."""
+        """Return the product with `store`, from which its stored units are read."""
         return replace(self, store=store)
 
     def has(self, index: int) -> bool:
-        """True where the store has a unit."""
+        """Return whether a unit is stored."""
         return self.store is not None and read_record(self.store, self.stage, self.names[index]) is not None
 
     def load(self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()) -> dict[str, Any]:
-        """Return the arrays of a unit, or a window of their last axes: read where the manifest has it, made where not.
+        """Return the arrays of a unit: read if the manifest has a record of it, otherwise made.
 
-        Tables of the unit are among them, whole, where `names` has theirs.
+        Parameters
+        ----------
+        index : int
+            Index of the unit.
+        names : tuple of str, optional
+            Names of the arrays, and of tables, to return; by default all arrays and no table.
+        window : tuple of slice
+            Window of the last axes of each array; by default the full array. Tables are always complete.
         """
         wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
         tables = [name for name in self.tables if name in (names or ())]
         if self.store is not None and self.has(index):
             read = self.reader(index)
-            beside = {name: table_beside(self.store, self.stage, name, self.names[index]) for name in tables}
-            found = {name: to_frame(read_parquet(path)) for name, path in beside.items()}
-            return {**{name: read(name, window) for name in wanted}, **found}
+            paths = {name: table_beside(self.store, self.stage, name, self.names[index]) for name in tables}
+            frames = {name: to_frame(read_parquet(path)) for name, path in paths.items()}
+            return {**{name: read(name, window) for name in wanted}, **frames}
         made = self.make(index)
-        return {**{name: _made(made[name])[(..., *window)] for name in wanted}, **{name: made[name] for name in tables}}
+        return {
+            **{name: _evaluated(made[name])[(..., *window)] for name in wanted},
+            **{name: made[name] for name in tables},
+        }
 
     def reader(self, unit: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
-        """Return what reads windows of the last axes of arrays of a stored unit: each is opened once."""
+        """Return a function that reads arrays of a stored unit; it opens each array once.
+
+        Returns
+        -------
+        callable
+            read(name, window) returns an array, or a window of its last axes. It raises a UserError if the stored
+            data are damaged or missing.
+        """
         assert self.store is not None
         group = read_group(self.store.images(self.stage))
-        place = self._place(unit)
+        unit_index = self._unit_index(unit)
         opened: dict[str, zarr.Array] = {}
 
         def read(name: str, window: tuple[slice, ...] = ()) -> np.ndarray:
             if name not in opened:
                 opened[name] = _array(group, name)
-            index: Any = (*place, ..., *window)
-            # what is not compressed has no files in parts: its chunks are read as they are, ten at a time
-            with self._damage_told(name, unit), few_chunks() if opened[name].shards else nullcontext():
+            index: Any = (*unit_index, ..., *window)
+            # arrays without shards are not compressed, so reading many of their chunks at a time takes little memory
+            with self._damage_reported(name, unit), limited_concurrency() if opened[name].shards else nullcontext():
                 return np.asarray(opened[name][index])
 
         return read
 
     @contextmanager
-    def _damage_told(self, name: str, unit: int) -> Iterator[None]:
-        """Turn what a decoder makes of damaged bytes into a UserError that names the array and the remedy."""
+    def _damage_reported(self, name: str, unit: int) -> Iterator[None]:
+        """Turn the errors of decoders into a UserError that names the array and the remedy."""
         try:
             yield
         except (FileNotFoundError, ValueError, RuntimeError) as error:
-            found = str(error).splitlines()[0] if str(error) else type(error).__name__
-            what = f"{self.stage} {self.names[unit]}: {name} is damaged ({found})"
-            raise UserError(f"{what}: romandask verify --forget, then run again") from error
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            damage = f"{self.stage} {self.names[unit]}: {name} is damaged ({reason})"
+            raise UserError(f"{damage}: romandask verify --forget, then run again") from error
 
     @property
     def stored_bytes(self) -> int:
@@ -140,7 +164,7 @@ class ImageProduct:
         return image_metadata_files(store, self.stage, [variable.name for variable in self.variables])
 
     def prepare(self, store: Store) -> None:
-        """Make the arrays and coordinates that units are written into."""
+        """Create the arrays that units are written into, and write the coordinates."""
         if not self.units:
             return
         group = open_images(store.images(self.stage), self.variables, self.lengths, self.axes)
@@ -149,35 +173,41 @@ class ImageProduct:
         group.attrs.update(self.attributes)
 
     def write(self, index: int, store: Store) -> Made:
-        """Make one unit and write it; no other unit shares its shards."""
+        """Make one unit and write it. No other unit shares its shards, so units can be written concurrently."""
         if self.stream is not None:
-            return self._written(self.stream(index), index, store)
-        # what is made may be what the maker keeps
+            return self._write_arrays(self.stream(index), index, store)
+        # a copy, because arrays are removed below and `make` may keep the dictionary
         arrays = dict(self.make(index))
         tables = {
             name: write_parquet(
-                table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], kind, name)
+                table_beside(store, self.stage, name, self.names[index]), conform(arrays[name], schema, name)
             )
-            for name, kind in self.tables.items()
+            for name, schema in self.tables.items()
         }
-        # each is let go once it is written
-        return self._written(((v.name, _made(arrays.pop(v.name))) for v in self.variables), index, store, tables)
+        # each array is freed once it is written
+        return self._write_arrays(
+            ((v.name, _evaluated(arrays.pop(v.name))) for v in self.variables), index, store, tables
+        )
 
     def verify(self, index: int, store: Store) -> str:
-        """Return the hash of what is stored of a unit: that of its record, where every byte is as it was written."""
+        """Return the hash of a stored unit; it equals `Record.output` if the unit is undamaged."""
         read = replace(self, store=store).reader(index)
         parts = {variable.name: digest(read(variable.name, ())) for variable in self.variables}
-        beside = {name: table_beside(store, self.stage, name, self.names[index]) for name in self.tables}
-        return digest(parts | {name: digest(path.read_bytes()) for name, path in beside.items()})
+        paths = {name: table_beside(store, self.stage, name, self.names[index]) for name in self.tables}
+        return digest(parts | {name: digest(path.read_bytes()) for name, path in paths.items()})
 
-    def _written(
-        self, arrays: Iterable[tuple[str, np.ndarray]], index: int, store: Store, tables: Mapping[str, bytes] = NOTHING
+    def _write_arrays(
+        self,
+        arrays: Iterable[tuple[str, np.ndarray]],
+        index: int,
+        store: Store,
+        tables: Mapping[str, bytes] = _NO_TABLES,
     ) -> Made:
-        """Write the arrays of a unit, one after another."""
+        """Write the arrays of a unit one after another; `tables` are the contents of its table files, for the hash."""
         variables = {variable.name: variable for variable in self.variables}
         parts, size, rows = {name: digest(content) for name, content in tables.items()}, 0, 0
         group = write_group(store.images(self.stage))
-        place = self._place(index)
+        unit_index = self._unit_index(index)
         for name, array in arrays:
             variable = variables.pop(name)
             if array.shape != variable.shape or not np.isfinite(array).all():
@@ -186,7 +216,7 @@ class ImageProduct:
                     f"{variable.shape}, or values that are not finite"
                 )
             array = array.astype(variable.dtype, copy=False)
-            write_array(_array(group, variable.name), place, array)
+            write_array(_array(group, variable.name), unit_index, array)
             parts[name] = digest(array)
             size, rows = size + array.nbytes, max(rows, array.size)
             del array
@@ -194,13 +224,13 @@ class ImageProduct:
             raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
         return Made(digest(parts), size, rows)
 
-    def _place(self, index: int) -> tuple[int, ...]:
-        """Return the indices of a unit along the axes of units."""
+    def _unit_index(self, index: int) -> tuple[int, ...]:
+        """Return the indices of a unit along the axes over units."""
         return tuple(int(k) for k in np.unravel_index(index, self.lengths))
 
     @cached_property
     def dataset(self) -> xr.Dataset:
-        """The lazy dataset, one chunk a unit; a unit's variables share one reading or making of it."""
+        """The lazy dataset, with one chunk per unit. The variables of a unit are read or made together, once."""
         chunks = tuple((1,) * length for length in self.lengths)
         name = f"{self.stage.replace('/', '-')}-" + digest([unit.settings for unit in self.units])
         source = dask.delayed(self, name=f"{name}-product", traverse=False)
@@ -236,13 +266,13 @@ class ImageProduct:
         return xr.Dataset(data, coordinates, self.attributes)
 
 
-def _made(array: Any) -> Any:
-    """Return an array, or what makes it when it is wanted."""
+def _evaluated(array: Any) -> Any:
+    """Return an array, or the result of the function that makes it."""
     return array() if callable(array) else array
 
 
 def table_beside(store: Store, stage: str, name: str, unit: str) -> AnyPath:
-    """Return the file of a table that belongs to one unit of an image product."""
+    """Return the file of a table (a name in `ImageProduct.tables`) of one unit of an image product."""
     return store.table(f"{stage}_{name}", unit)
 
 

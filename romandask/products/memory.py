@@ -1,4 +1,4 @@
-"""Memory of a process: how much it has held, and how it goes back to the system."""
+"""Resident memory of a process: its peak, and the release of free memory to the operating system."""
 
 from __future__ import annotations
 
@@ -9,27 +9,33 @@ from contextlib import suppress
 from pathlib import Path
 
 INTERPRETER = 480 << 20
-"""Bytes of a worker between units: Python, what is imported, and what it keeps of detectors and spectra."""
+"""Bytes that a worker holds between units: Python, imported modules, and cached detector and spectral data."""
 
 
 def release_free_memory() -> None:
-    """Give free memory to the system, where the C library can: what a unit's first half took is a tenth of a worker."""
+    """Return free heap memory to the operating system, if the C library can (glibc).
+
+    What the first half of a unit leaves free on the heap is about a tenth of a worker's memory.
+    """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def reset_peak() -> int:
-    """Let `peak_memory` begin anew, where the system can (Linux), and return what it is now: what the process holds."""
+    """Reset the peak that `peak_memory` reports, and return the memory that the process holds now, bytes.
+
+    Only Linux can reset the peak; elsewhere the peak since the start of the process is returned.
+    """
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return peak_memory()
 
 
 def peak_memory() -> int:
-    """Return the most resident memory, bytes, that this process has had since `reset_peak`."""
+    """Return the peak resident memory, bytes, of this process since the last `reset_peak`."""
     try:
-        found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+        match = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
-        found = None
-    return (int(found.group(1)) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * 1024
+        match = None
+    return (int(match.group(1)) if match else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * 1024

@@ -1,4 +1,4 @@
-"""Catalog schemas: catalogs/<product>.yaml to an Arrow schema with units, UCDs and descriptions."""
+"""Catalog schemas: Arrow schemas, with units, UCDs and descriptions, read from catalogs/<product>.yaml."""
 
 from __future__ import annotations
 
@@ -24,20 +24,29 @@ TYPES = {
 
 @lru_cache(maxsize=32)
 def schema(name: str, bands: tuple[str, ...] = ()) -> pa.Schema:
-    """Return the schema of a product; columns with {band} are repeated for every band, with {rubin} for LSST's."""
+    """Return the schema of a product.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file in catalogs/, without .yaml.
+    bands : tuple of str
+        Bands for which columns with {band} in their name are repeated. Columns with {rubin} are repeated for the six
+        LSST bands.
+    """
     content = read_yaml(resource_folder("catalogs") / f"{name}.yaml")
     fields = []
     for column in content["columns"]:
-        for mark, values in (("{band}", bands), ("{rubin}", tuple("ugrizy")), ("", ("",))):
-            if mark in column["name"]:
-                fields += [_field(column, mark, value) for value in values]
+        for placeholder, values in (("{band}", bands), ("{rubin}", tuple("ugrizy")), ("", ("",))):
+            if placeholder in column["name"]:
+                fields += [_field(column, placeholder, value) for value in values]
                 break
     return pa.schema(fields, metadata={"description": content["description"]})
 
 
-def _field(column: dict, mark: str, value: str) -> pa.Field:
+def _field(column: dict, placeholder: str, value: str) -> pa.Field:
     name, description = column["name"], column["description"]
-    if mark:
-        name, description = name.replace(mark, value), description.replace(mark, value)
+    if placeholder:
+        name, description = name.replace(placeholder, value), description.replace(placeholder, value)
     metadata = {"unit": column.get("unit") or "", "ucd": column.get("ucd") or "", "description": description}
     return pa.field(name, TYPES[column["dtype"]], metadata=metadata)

@@ -1,4 +1,4 @@
-"""Units: the things that a stage makes, one by one; a survey may have hundreds of thousands, made when asked for."""
+"""Units: the pieces in which a stage makes its product. A survey may have hundreds of thousands of them."""
 
 from __future__ import annotations
 
@@ -9,34 +9,40 @@ from typing import Any, overload
 
 @dataclass(frozen=True)
 class Unit:
-    """One thing that a stage makes."""
+    """One piece of a product, made and stored by one task."""
 
     name: str
-    """Unique within the stage; also its file name."""
+    """Name, unique within the stage; also the file name."""
     settings: Any
-    """Everything but upstream units that its content depends on, as values that JSON can hold."""
+    """Everything that the content depends on apart from upstream units, as JSON values."""
     inputs: tuple[tuple[str, str], ...] = ()
-    """(stage, unit) of the upstream units that it reads."""
+    """(stage, unit) of the upstream units that this unit reads."""
     cost: float = 1.0
-    """Relative time, so that long units go first."""
+    """Relative time to make the unit; the most expensive units are made first."""
     prerequisites: tuple[str, ...] = ()
-    """Units of the same stage that must be there before it; `settings` and `inputs` say what it takes from them."""
+    """Units of the same stage that must be stored first. What this unit takes from them is covered by `settings` and
+    `inputs`."""
     optional: tuple[tuple[str, str], ...] = ()
-    """Upstream units that it reads where they are there, and can be made without."""
+    """(stage, unit) of upstream units that this unit reads if they are stored, and does not need."""
     affinity: str = ""
-    """Units of one kin are made one after another: what a worker keeps for the one it has for the next."""
+    """Affinity key: units with the same key are made one after another, so that a worker can reuse its caches."""
 
 
 @dataclass(frozen=True)
 class LazyUnits(Sequence[Unit]):
-    """Units of which only the names are there; the rest is worked out for one when it is asked for."""
+    """Sequence of units with known names; each unit is constructed when it is accessed.
+
+    A serialised copy, such as a worker receives, has only the names; its units cannot be accessed.
+    """
 
     names: tuple[str, ...]
+    """Names of the units."""
     make: Callable[[int], Unit]
+    """Constructs the unit with a given index."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # whoever makes units elsewhere is told which and needs their names alone
-        return LazyUnits, (self.names, _not_here)
+        # a worker receives the index of a unit and needs only its name; `make` may hold large objects
+        return LazyUnits, (self.names, _unavailable)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -46,7 +52,7 @@ class LazyUnits(Sequence[Unit]):
     @overload
     def __getitem__(self, index: slice) -> Sequence[Unit]: ...
     def __getitem__(self, index: int | slice) -> Unit | Sequence[Unit]:
-        """Return one unit, or those of a slice."""
+        """Return one unit, or a list of the units of a slice."""
         if isinstance(index, slice):
             return [self.make(k) for k in range(*index.indices(len(self)))]
         return self.make(range(len(self))[index])
@@ -55,8 +61,8 @@ class LazyUnits(Sequence[Unit]):
         return map(self.make, range(len(self)))
 
 
-def _not_here(index: int) -> Unit:
-    raise RuntimeError("units are worked out where the product was put together, not where they are made")
+def _unavailable(index: int) -> Unit:
+    raise RuntimeError("units were serialised as names only; access them in the process that constructed the product")
 
 
 def names_of(units: Sequence[Unit]) -> tuple[str, ...]:
@@ -66,9 +72,11 @@ def names_of(units: Sequence[Unit]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Made:
-    """What storing one unit wrote."""
+    """Summary of a unit that has been written."""
 
     output: str
     """Hash of the content."""
     bytes: int
+    """Uncompressed size, bytes."""
     rows: int
+    """Number of rows of a table, or of elements of the largest array of an image product."""

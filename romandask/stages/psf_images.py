@@ -45,14 +45,14 @@ def psfs(exposures: Exposures) -> ImageProduct:
         "pixel_scale": instrument.pixel_scale / OVERSAMPLING,
     }
     return ImageProduct(
-        f"psfs/{instrument.name}",
-        LazyUnits(exposures.names, unit),
-        MakePsf(renderer),
-        (Variable("psf", "float32", (side, side), ("v", "u"), text),),
-        images.axes,
-        images.lengths,
-        images.coordinates,
-        {"survey": instrument.name},
+        stage=f"psfs/{instrument.name}",
+        units=LazyUnits(exposures.names, unit),
+        make=MakePsf(renderer),
+        variables=(Variable("psf", "float32", (side, side), ("v", "u"), text),),
+        axes=images.axes,
+        lengths=images.lengths,
+        coordinates=images.coordinates,
+        attributes={"survey": instrument.name},
         bytes_per_unit=350 << 20,
         seconds_per_unit=0.7,
     )

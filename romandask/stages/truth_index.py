@@ -27,10 +27,10 @@ def truth_index(exposures: Exposures) -> TableProduct:
         return exposures.units[row]
 
     return TableProduct(
-        f"truth_index/{renderer.instrument.name}",
-        LazyUnits(exposures.names, unit),
-        MakeIndex(renderer),
-        schema("truth_index"),
+        stage=f"truth_index/{renderer.instrument.name}",
+        units=LazyUnits(exposures.names, unit),
+        make=MakeIndex(renderer),
+        schema=schema("truth_index"),
         bytes_per_unit=int(np.prod(renderer.instrument.shape)) * 16 + (520 << 20),
         seconds_per_unit=1.2,
     )

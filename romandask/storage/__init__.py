@@ -1,1 +1,1 @@
-"""Files of a store, in a folder or an object store: paths, records, checksums, the lock."""
+"""Store files, on a local disk or in an object store: paths, manifest records, checksums and the lock."""

@@ -1,4 +1,4 @@
-"""One driver a store: a second is refused, a stale lock is taken over."""
+"""The lock of a store: one driver at a time. A lock whose process has ended is taken over."""
 
 from __future__ import annotations
 
@@ -11,20 +11,31 @@ from contextlib import contextmanager
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, remove, write_new
 
-_LOCK = ".lock"
+_LOCK_FILE = ".lock"
 
 
 @contextmanager
 def locked(root: AnyPath) -> Iterator[None]:
-    """Hold the store's lock; UserError where another living driver on this host, or any on another, holds it."""
-    path = root / _LOCK
-    mine = {"pid": os.getpid(), "host": socket.gethostname()}
+    """Hold the lock of a store.
+
+    Parameters
+    ----------
+    root : path
+        Root of the store.
+
+    Raises
+    ------
+    UserError
+        If a running process on this host, or any process on another host, holds the lock.
+    """
+    path = root / _LOCK_FILE
+    own = {"pid": os.getpid(), "host": socket.gethostname()}
     for _ in range(2):
         try:
-            write_new(path, json.dumps(mine).encode())
+            write_new(path, json.dumps(own).encode())
             break
         except FileExistsError:
-            _refuse_or_remove(path, mine)
+            _refuse_or_remove(path, own)
     else:
         raise UserError(f"{root}: another driver has just taken the store")
     try:
@@ -34,15 +45,15 @@ def locked(root: AnyPath) -> Iterator[None]:
 
 
 def in_use(root: AnyPath) -> bool:
-    """True where a driver holds the store: one on this host that lives, or any on another."""
-    held = _holder(root / _LOCK)
-    if held is None:
+    """Return whether a running process on this host, or any process on another host, holds the lock of a store."""
+    holder = _holder(root / _LOCK_FILE)
+    if holder is None:
         return False
-    return held.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(held.get("pid") or 0))
+    return holder.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(holder.get("pid") or 0))
 
 
 def _holder(path: AnyPath) -> dict | None:
-    """Return who holds a lock; None where nobody does."""
+    """Return the process that holds a lock: None if there is no lock, an empty dict if its file cannot be read."""
     try:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -51,12 +62,12 @@ def _holder(path: AnyPath) -> dict | None:
         return {}
 
 
-def _refuse_or_remove(path: AnyPath, mine: dict) -> None:
-    held = _holder(path) or {}
-    if held.get("host", mine["host"]) != mine["host"]:
-        raise UserError(f"{path.parent}: in use by a driver on {held['host']}; if it is gone, remove {path}")
-    if held.get("pid") and held["pid"] != mine["pid"] and _alive(int(held["pid"])):
-        raise UserError(f"{path.parent}: in use by another driver (process {held['pid']}); wait for it or stop it")
+def _refuse_or_remove(path: AnyPath, own: dict) -> None:
+    holder = _holder(path) or {}
+    if holder.get("host", own["host"]) != own["host"]:
+        raise UserError(f"{path.parent}: in use by a driver on {holder['host']}; if it is gone, remove {path}")
+    if holder.get("pid") and holder["pid"] != own["pid"] and _alive(int(holder["pid"])):
+        raise UserError(f"{path.parent}: in use by another driver (process {holder['pid']}); wait for it or stop it")
     remove(path)
 
 

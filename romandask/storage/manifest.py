@@ -1,4 +1,4 @@
-"""The manifest: one record a unit, written after its data. A unit is done if and only if its record says so."""
+"""The manifest: one record per unit, written after the data. A unit is stored if and only if it has a record."""
 
 from __future__ import annotations
 
@@ -16,80 +16,82 @@ from romandask.storage.store import Store, write_json
 
 @dataclass(frozen=True)
 class Record:
-    """What is known of a unit that has been stored."""
+    """The manifest entry of a stored unit."""
 
     stage: str
     unit: str
     inputs: str
-    """Hash of everything that the unit depends on."""
+    """Input hash: hash of everything that the content of the unit depends on."""
     output: str
-    """Hash of what was made, independent of compression."""
+    """Hash of the content, independent of compression."""
     bytes: int
-    """Uncompressed size."""
+    """Uncompressed size, bytes."""
     rows: int
-    """Rows of a table, pixels of an image."""
+    """Number of rows of a table, or of pixels of an image."""
     seconds: float
+    """Wall time of making and writing the unit, s."""
     peak_bytes: int
-    """Most resident memory of the worker while it made it."""
+    """Peak resident memory of the worker while it made the unit, bytes."""
     warnings: list[str] = field(default_factory=list)
+    """Warnings raised while the unit was made."""
     parts: dict[str, str] = field(default_factory=dict)
-    """What `inputs` is the hash of: settings, version, and the outputs of each stage that is read, by its name."""
+    """Hashes that `inputs` combines: settings, version and, by stage name, the outputs of each stage that was read."""
 
 
 def read_record(store: Store, stage: str, unit: str) -> Record | None:
-    """Return the record of a unit; None where there is none, or where it cannot be read or is damaged."""
+    """Return the record of a unit, or None if it is missing, unreadable or damaged."""
     try:
-        return _parsed(store.record(stage, unit).read_bytes())
+        return _parse(store.record(stage, unit).read_bytes())
     except OSError:
         return None
 
 
 def read_records(store: Store, stage: str) -> Iterator[tuple[str, Record | None]]:
-    """Yield the units of a stage that have a record, in order, and their records; None where one is damaged."""
+    """Yield the names of the recorded units of a stage, sorted, with their records; None for a damaged record."""
     for name, content in read_files(store.records(stage), ".json"):
-        yield name, _parsed(content)
+        yield name, _parse(content)
 
 
-def _parsed(text: bytes) -> Record | None:
+def _parse(content: bytes) -> Record | None:
     try:
-        content = json.loads(text)
-        check = content.pop("check")
-        return Record(**content) if check == digest(content) else None
+        fields = json.loads(content)
+        check = fields.pop("check")
+        return Record(**fields) if check == digest(fields) else None
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
 def write_record(store: Store, record: Record) -> None:
-    """Write a record, atomically, with a hash of itself: one that is damaged is none."""
+    """Write a record atomically, with a hash of its content, by which `read_record` rejects a damaged one."""
     content = asdict(record)
     write_json(store.record(record.stage, record.unit), {**content, "check": digest(content)})
 
 
 class Digest:
-    """A hash of values that come one after another."""
+    """Incremental hash (BLAKE2b, 16 bytes) of a sequence of values."""
 
     def __init__(self) -> None:
-        self._state = hashlib.blake2b(digest_size=16)
+        self._hash = hashlib.blake2b(digest_size=16)
 
     def add(self, part: Any) -> None:
-        """Add mappings and sequences by their sorted JSON, arrays and bytes by their content."""
+        """Add a value: bytes by their content, an array by type, shape and content, any other value by its JSON."""
         if isinstance(part, bytes):
-            self._state.update(part)
+            self._hash.update(part)
         elif isinstance(part, np.ndarray):
-            self._state.update(f"{part.dtype.str}{part.shape}".encode())
-            self._state.update(np.ascontiguousarray(part).data)
+            self._hash.update(f"{part.dtype.str}{part.shape}".encode())
+            self._hash.update(np.ascontiguousarray(part).data)
         else:
-            self._state.update(json.dumps(part, sort_keys=True, default=str).encode())
-        self._state.update(b"\0")
+            self._hash.update(json.dumps(part, sort_keys=True, default=str).encode())
+        self._hash.update(b"\0")
 
     def value(self) -> str:
-        """Return the hash of what was added."""
-        return self._state.hexdigest()
+        """Return the hash of the values added so far, in hexadecimal."""
+        return self._hash.hexdigest()
 
 
 def digest(*parts: Any) -> str:
-    """Return a hash of values (see Digest)."""
-    state = Digest()
+    """Return the hash of a sequence of values (see `Digest.add`)."""
+    total = Digest()
     for part in parts:
-        state.add(part)
-    return state.value()
+        total.add(part)
+    return total.value()

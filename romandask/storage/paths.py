@@ -1,7 +1,7 @@
-"""Places: files of this machine and of object stores (s3://bucket/key), by one interface.
+"""Paths of local files and of objects in an object store (s3://bucket/key), behind one interface.
 
-What is read of sources and what a store holds may be either. Credentials and the address of the service are those of
-the environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL), never part of a name or of a product.
+Sources and stores may be in either. The credentials and the endpoint of an object store come from the environment
+(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL); they are never part of a path or of a product.
 """
 
 from __future__ import annotations
@@ -21,23 +21,30 @@ from upath import UPath
 from romandask.model.errors import UserError
 
 AnyPath = Path
-"""A file or a folder: a Path, or a UPath, which has its methods and is said to be one."""
+"""Path of a file or a folder: a Path, or a UPath, which has the same methods and is annotated as a Path."""
 SCHEMES = ("s3",)
-"""Of addresses that are taken; what others do with parts of files and with two writers has not been tried."""
+"""URL schemes that are accepted. Others are untested with respect to partial reads and concurrent writers."""
 OPTIONS: dict[str, Any] = {"use_listings_cache": False}
-"""Other processes write too: what a folder holds is asked anew each time."""
-_AT_ONCE = 500
-"""Objects that are asked for together."""
+"""fsspec options: no cache of folder listings, because other processes write to the store as well."""
+_OBJECTS_PER_REQUEST = 500
+"""Number of objects that are fetched concurrently."""
 
 
 def parse_path(text: str | AnyPath, what: str = "a store") -> AnyPath:
-    """Return the place that a user names, absolute.
+    """Return the absolute path for a path or URL given by a user.
+
+    Parameters
+    ----------
+    text : str or path
+        Local path, or s3://BUCKET/FOLDER.
+    what : str
+        What the path is for, as error messages name it.
 
     Raises
     ------
     UserError
-        If it is an address of a kind that is not known, names no bucket or leads out of it, or if what reads it is not
-        installed.
+        If the URL has an unknown scheme, names no bucket, contains characters or parts that are not allowed, or if
+        s3fs is not installed.
     """
     if "://" not in str(text):
         return Path(text).resolve()
@@ -49,62 +56,65 @@ def parse_path(text: str | AnyPath, what: str = "a store") -> AnyPath:
         raise UserError(f"{text}: {what} is s3://BUCKET/FOLDER, without empty parts, . and .., and ? # * [ ]")
     if importlib.util.find_spec("s3fs") is None:
         raise UserError(f"{text}: s3fs is not installed: pip install 'romandask[s3]'")
-    found: Any = UPath(f"{scheme}://{'/'.join(parts)}", **OPTIONS)
-    return found
+    path: Any = UPath(f"{scheme}://{'/'.join(parts)}", **OPTIONS)
+    return path
 
 
 @contextmanager
-def access_errors_explained(place: AnyPath) -> Iterator[None]:
-    """Turn what goes wrong with an object store (no such bucket, no answer, no credentials) into a UserError."""
+def access_errors_explained(path: AnyPath) -> Iterator[None]:
+    """Turn errors of an object store (no such bucket, no answer, no credentials) into a UserError.
+
+    Errors for local paths pass unchanged.
+    """
     try:
         yield
     except UserError:
         raise
     except Exception as error:
-        # botocore has a hundred kinds; all of them say in a line what is wrong
-        if isinstance(place, Path):
+        # botocore has about a hundred exception classes without a common base; each message is one clear line
+        if isinstance(path, Path):
             raise
         raise UserError(
-            f"{place}: cannot be reached ({str(error) or type(error).__name__}): look at the bucket's name and at "
+            f"{path}: cannot be reached ({str(error) or type(error).__name__}): look at the bucket's name and at "
             "AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
         ) from None
 
 
 def resolve_below(folder: AnyPath, text: str | AnyPath) -> AnyPath:
-    """Return a place that is named from a folder, or by itself: an absolute path, an address."""
+    """Return the path of a source: a path relative to a folder, an absolute path, or a URL."""
     return parse_path(text, "a source") if "://" in str(text) else folder / str(text)
 
 
 def local_copy(path: AnyPath) -> Path:
-    """Return a file of this machine with the content of another: itself, or a copy of an object.
+    """Return a local file with the content of a path: the path itself, or a cached copy of an object.
 
-    Copies are kept by their content's tag, in the folder `romandask` of the user's cache (XDG_CACHE_HOME), so that the
-    processes of a machine fetch an object once.
+    Copies are cached under the object's URL and its ETag, size and time in the folder `romandask` of the user's cache
+    (XDG_CACHE_HOME), so that the processes of one machine fetch an object once.
     """
     if isinstance(path, Path):
         return path
     tag = hashlib.blake2b(f"{path}\n{_tag(path)}".encode(), digest_size=12).hexdigest()
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "romandask" / "inputs"
-    found = cache / tag / path.name
-    if not found.exists():
-        found.parent.mkdir(parents=True, exist_ok=True)
-        partial = found.with_name(f".{uuid.uuid4().hex}.partial")
+    copy = cache / tag / path.name
+    if not copy.exists():
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        partial = copy.with_name(f".{uuid.uuid4().hex}.partial")
         try:
             path.fs.get_file(path.path, str(partial))
-            os.replace(partial, found)
+            os.replace(partial, copy)
         finally:
             partial.unlink(missing_ok=True)
-    return found
+    return copy
 
 
 def file_state(path: AnyPath) -> list[int]:
-    """Return what tells whether a file has changed: its bytes and the time (ns) at which it was written."""
-    found = path.stat()
-    return [int(found.st_size), int(found.st_mtime_ns)]
+    """Return the size (bytes) and the modification time (ns) of a file, by which changes are detected."""
+    status = path.stat()
+    return [int(status.st_size), int(status.st_mtime_ns)]
 
 
 def write_bytes(path: AnyPath, content: bytes) -> None:
-    """Write a file so that it appears whole or not at all."""
+    """Write a file atomically: it appears complete or not at all."""
     if not isinstance(path, Path):
         path.fs.pipe_file(path.path, content)
         return
@@ -118,7 +128,7 @@ def write_bytes(path: AnyPath, content: bytes) -> None:
 
 
 def write_new(path: AnyPath, content: bytes) -> None:
-    """Write a file that is not there yet; FileExistsError where it is, whoever else tries at the same time."""
+    """Create a file; raise FileExistsError if it exists, also if another process creates it at the same time."""
     if isinstance(path, Path):
         with open(path, "xb") as file:
             file.write(content)
@@ -127,7 +137,7 @@ def write_new(path: AnyPath, content: bytes) -> None:
 
 
 def remove(path: AnyPath) -> None:
-    """Remove a file, if it is there."""
+    """Remove a file if it exists."""
     if isinstance(path, Path):
         path.unlink(missing_ok=True)
     else:
@@ -135,7 +145,7 @@ def remove(path: AnyPath) -> None:
 
 
 def remove_folder(path: AnyPath) -> None:
-    """Remove a folder and what it holds, if it is there."""
+    """Remove a folder and its content if it exists."""
     if isinstance(path, Path):
         shutil.rmtree(path, ignore_errors=True)
     elif path.exists():
@@ -143,7 +153,10 @@ def remove_folder(path: AnyPath) -> None:
 
 
 def file_names(folder: AnyPath, ending: str) -> list[str]:
-    """Return the names, less an ending, of the files of a folder that have it; none where there is no folder."""
+    """Return the names, without the suffix `ending`, of the files in a folder that have this suffix, sorted.
+
+    Hidden files are left out. A folder that does not exist has no files.
+    """
     try:
         if isinstance(folder, Path):
             names = os.listdir(folder)
@@ -155,34 +168,37 @@ def file_names(folder: AnyPath, ending: str) -> list[str]:
 
 
 def read_files(folder: AnyPath, ending: str) -> Iterator[tuple[str, bytes]]:
-    """Yield the names, less an ending, and the bytes of the files of a folder that have it: of objects many at once."""
+    """Yield the names, without the suffix `ending`, and the contents of the files in a folder that have this suffix.
+
+    Objects are fetched many at a time.
+    """
     names = file_names(folder, ending)
     if isinstance(folder, Path):
         for name in names:
-            # one that a run has just removed is not there
+            # another process may have removed it since the folder was listed
             with suppress(FileNotFoundError):
                 yield name, (folder / f"{name}{ending}").read_bytes()
         return
-    for start in range(0, len(names), _AT_ONCE):
-        keys = {(folder / f"{name}{ending}").path: name for name in names[start : start + _AT_ONCE]}
+    for start in range(0, len(names), _OBJECTS_PER_REQUEST):
+        keys = {(folder / f"{name}{ending}").path: name for name in names[start : start + _OBJECTS_PER_REQUEST]}
         for key, content in folder.fs.cat(list(keys), on_error="omit").items():
             yield keys[key], content
 
 
 def bytes_below(folder: AnyPath) -> int:
-    """Return the bytes of all files below a folder."""
+    """Return the total size, bytes, of all files below a folder."""
     if isinstance(folder, Path):
         return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return int(folder.fs.du(folder.path))
 
 
 def files_below(folder: AnyPath) -> list[AnyPath]:
-    """Return all files below a folder, in order."""
+    """Return all files below a folder, sorted."""
     if isinstance(folder, Path):
         return sorted(path for path in folder.rglob("*") if path.is_file())
     return [folder.joinpath(key.removeprefix(f"{folder.path}/")) for key in sorted(folder.fs.find(folder.path))]
 
 
 def _tag(path: Any) -> str:
-    found = path.fs.info(path.path)
-    return f"{found.get('ETag')} {found.get('size')} {found.get('LastModified')}"
+    info = path.fs.info(path.path)
+    return f"{info.get('ETag')} {info.get('size')} {info.get('LastModified')}"

@@ -106,7 +106,14 @@ def whole_survey() -> None:
     cells = tuple(map(int, REGION.cells(ORDER)))
     units = tuple(Unit(f"{ORDER}-{cell}", cell) for cell in cells)
     tables = {
-        name: TableProduct(f"samples/{name}", units, Made(name, cells), schema("samples", ("i",)), cells, ORDER)
+        name: TableProduct(
+            stage=f"samples/{name}",
+            units=units,
+            make=Made(name, cells),
+            schema=schema("samples", ("i",)),
+            pixels=cells,
+            order=ORDER,
+        )
         for name in COUNTS
     }
     with tempfile.TemporaryDirectory() as folder, runner(2, 2.0) as execution:

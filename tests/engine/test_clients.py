@@ -45,7 +45,7 @@ class Failing:
 def test_units_after_one_that_fails_are_given_up_and_named_and_others_are_made(tmp_path, workers):
     maker = Failing(tmp_path, (1,))
     units = tuple(Unit(f"u{k}", k) for k in range(6))
-    product = TableProduct("table/x", units, maker, pa.schema([("number", pa.int64())]))
+    product = TableProduct(stage="table/x", units=units, make=maker, schema=pa.schema([("number", pa.int64())]))
     # 1 fails; 2 and 4 come after it, 3 after 2; 0 and 5 have nothing to do with it, 5 comes after 0
     after = {2: (1,), 3: (2,), 4: (1, 0), 5: (0,)}
     tasks = [Task(k, "inputs", 1.0, "", after.get(k, ())) for k in range(6)]
@@ -76,7 +76,9 @@ class Slow:
 def test_the_last_of_a_few_long_units_does_not_wait_behind_another(tmp_path):
     """Three units on two workers: the third goes to the worker that is free first, whatever dask thinks of them."""
     units = tuple(Unit(f"u{k}", k) for k in range(3))
-    product = TableProduct("table/x", units, Slow(), pa.schema([("process", pa.int64())]), seconds_per_unit=60.0)
+    product = TableProduct(
+        stage="table/x", units=units, make=Slow(), schema=pa.schema([("process", pa.int64())]), seconds_per_unit=60.0
+    )
     store = Store(tmp_path / "store")
     with runner(2, 1.5) as execution:
         tasks = [Task(k, "inputs", 1.0, f"kin {k % 2}") for k in range(3)]
@@ -135,7 +137,9 @@ def test_workers_that_die_before_they_begin_are_started_again(monkeypatch):
 def test_local_workers_that_are_gone_for_good_are_started_again(tmp_path):
     """As when one dies while its nanny starts it: dask leaves it at that."""
     units = tuple(Unit(f"u{k}", k) for k in range(3))
-    product = TableProduct("table/x", units, Failing(tmp_path, ()), pa.schema([("number", pa.int64())]))
+    product = TableProduct(
+        stage="table/x", units=units, make=Failing(tmp_path, ()), schema=pa.schema([("number", pa.int64())])
+    )
     tasks = [Task(k, "inputs", 1.0) for k in range(3)]
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}), runner(1, 1.5) as execution:
         execution._client.retire_workers(close_workers=True)

@@ -56,7 +56,11 @@ class Waits:
 
 def stage_of(name, units, maker, inputs=(), seconds=0.0):
     product = TableProduct(
-        name, tuple(Unit(f"u{k}", k, inputs) for k in range(units)), maker, SCHEMA, seconds_per_unit=seconds
+        stage=name,
+        units=tuple(Unit(f"u{k}", k, inputs) for k in range(units)),
+        make=maker,
+        schema=SCHEMA,
+        seconds_per_unit=seconds,
     )
     reads = frozenset(stage for stage, _ in inputs)
     return RunnableStage(name=name, product=lambda: product, reads=reads)
@@ -106,7 +110,7 @@ def test_units_are_not_known_before_truth_and_pointings_are_there(tmp_path):
 
     def put_together():
         asked.append([*store.recorded("truth/stars"), *store.recorded("pointings/x")])
-        return TableProduct("exposures/x", (Unit("u0", 0),), Waits(), SCHEMA)
+        return TableProduct(stage="exposures/x", units=(Unit("u0", 0),), make=Waits(), schema=SCHEMA)
 
     found = [
         stage_of("truth/stars", 1, Waits()),
@@ -160,7 +164,11 @@ def test_of_a_later_stage_nothing_is_handed_out_while_an_earlier_one_has_units_t
 
     def wave(name, units, seconds, rank):
         product = TableProduct(
-            name, tuple(Unit(f"u{k}", k) for k in range(units)), Waits(), SCHEMA, seconds_per_unit=seconds
+            stage=name,
+            units=tuple(Unit(f"u{k}", k) for k in range(units)),
+            make=Waits(),
+            schema=SCHEMA,
+            seconds_per_unit=seconds,
         )
         tasks = [Task(k, "inputs", 1.0) for k in range(units)]
         return Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
@@ -178,7 +186,13 @@ def test_units_that_wait_for_others_of_their_stage_do_not_keep_those_of_a_later_
     """Twenty exposures of one detector, each after the one before it: the other worker has the index."""
     client, threads = Client(), {"one": 1, "two": 1}
     first, second = (
-        TableProduct(name, tuple(Unit(f"u{k}", k) for k in range(20)), Waits(), SCHEMA, seconds_per_unit=seconds)
+        TableProduct(
+            stage=name,
+            units=tuple(Unit(f"u{k}", k) for k in range(20)),
+            make=Waits(),
+            schema=SCHEMA,
+            seconds_per_unit=seconds,
+        )
         for name, seconds in (("exposures/x", 60.0), ("truth_index/x", 1.0))
     )
     chain = [Task(k, "inputs", 20.0 - k, "", (k - 1,) if k else ()) for k in range(20)]

@@ -1,4 +1,4 @@
-"""Stores and sources in an object store: against a server of the S3 protocol on the loopback."""
+"""Stores and sources in an object store, tested with a local S3 server (moto)."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 import s3fs
 from conftest import command
-from test_store import images
+from test_store import image_product
 
 import romandask
 from romandask.engine.event_log import Log, events, newest_event, runs
@@ -38,7 +38,7 @@ from romandask.storage.store import Store
 
 @pytest.fixture(scope="module")
 def bucket(tmp_path_factory):
-    """A bucket of a server that lives as long as the tests of this file, and the environment that names it."""
+    """URL of a bucket of an S3 server that runs during the tests of this module, with the environment set for it."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -67,7 +67,7 @@ def bucket(tmp_path_factory):
 
 @pytest.fixture
 def folder(bucket):
-    """A folder of the bucket that no other test uses."""
+    """Path of a folder in the bucket that no other test uses."""
     return parse_path(f"{bucket}/{uuid.uuid4().hex}")
 
 
@@ -77,7 +77,7 @@ def upload(source: Path, to: str) -> None:
 
 @pytest.fixture(scope="module")
 def survey(bucket, tiny_store):
-    """The tiny survey, moved into the bucket."""
+    """URL of a copy of the tiny survey in the bucket."""
     upload(tiny_store, f"{bucket}/tiny")
     return f"{bucket}/tiny"
 
@@ -93,19 +93,19 @@ def survey(bucket, tiny_store):
         ("s3://surveys/a?versionId=1", "without empty parts"),
     ],
 )
-def test_only_addresses_that_can_be_what_they_say_are_taken(text, what):
+def test_invalid_urls_are_rejected(text, what):
     with pytest.raises(UserError, match=what):
         parse_path(text)
 
 
-def test_a_file_that_is_there_is_not_written_again(folder):
+def test_an_existing_file_is_not_overwritten_by_write_new(folder):
     write_new(folder / "a", b"1")
     with pytest.raises(FileExistsError):
         write_new(folder / "a", b"2")
     assert (folder / "a").read_bytes() == b"1"
 
 
-def test_many_objects_are_read_together_and_other_endings_are_left_out(folder):
+def test_files_of_a_folder_are_read_by_their_suffix(folder):
     for k in range(3):
         write_new(folder / f"u{k}.json", str(k).encode())
     write_new(folder / "u1.failed", b"why")
@@ -116,7 +116,7 @@ def test_many_objects_are_read_together_and_other_endings_are_left_out(folder):
     assert files_below(folder) == []
 
 
-def test_a_source_is_fetched_once_and_again_when_it_changes(folder):
+def test_a_source_is_downloaded_once_and_again_after_a_change(folder):
     path = resolve_below(folder, "catalog.txt")
     path.write_bytes(b"old")
     first = local_copy(path)
@@ -132,59 +132,59 @@ def test_a_source_is_fetched_once_and_again_when_it_changes(folder):
 def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(folder):
     with locked(folder):
         assert in_use(folder)
-        held = json.loads((folder / ".lock").read_bytes())
-        (folder / ".lock").write_text(json.dumps(held | {"pid": os.getppid()}))
+        holder = json.loads((folder / ".lock").read_bytes())
+        (folder / ".lock").write_text(json.dumps(holder | {"pid": os.getppid()}))
         with pytest.raises(UserError, match="in use by another driver"), locked(folder):
             pass
-        (folder / ".lock").write_text(json.dumps(held | {"pid": 2**22 + 1}))
+        (folder / ".lock").write_text(json.dumps(holder | {"pid": 2**22 + 1}))
         with locked(folder):
             assert in_use(folder)
     assert not in_use(folder)
 
 
-def test_a_log_goes_out_in_parts(folder):
+def test_a_log_is_uploaded_in_parts(folder):
     log = Log(folder / "log")
     log.write("run", pipeline="x")
     for k in range(5):
         log.write("unit", unit=f"u{k}")
-    assert [one["event"] for one in events(folder / "log", log.name)] == ["run"]
+    assert [event["event"] for event in events(folder / "log", log.name)] == ["run"]
     log.write("end", how="done")
     assert runs(folder / "log") == [log.name]
-    assert [one["event"] for one in events(folder / "log", log.name)] == ["run", *["unit"] * 5, "end"]
+    assert [event["event"] for event in events(folder / "log", log.name)] == ["run", *["unit"] * 5, "end"]
     assert newest_event(folder / "log")["how"] == "done"
 
 
-@pytest.mark.parametrize("where", ["bucket", "folder"])
-def test_images_come_back_and_a_chunk_that_is_gone_is_an_error(where, folder, tmp_path):
-    store = Store(folder if where == "bucket" else tmp_path)
-    product = images(3).stored(store)
+@pytest.mark.parametrize("location", ["bucket", "disk"])
+def test_images_are_read_back_and_a_missing_chunk_is_an_error(location, folder, tmp_path):
+    store = Store(folder if location == "bucket" else tmp_path)
+    product = image_product(3).stored(store)
     product.prepare(store)
     made = product.write(1, store)
     assert product.verify(1, store) == made.output
-    np.testing.assert_array_equal(product.reader(1)("image"), images(3).make(1)["image"])
+    np.testing.assert_array_equal(product.reader(1)("image"), image_product(3).make(1)["image"])
     with pytest.raises(UserError, match=r"image is damaged \(.*the chunk is gone\): romandask verify --forget"):
         product.reader(2)("image")
 
 
-def test_a_survey_in_a_bucket_is_read_and_verified_as_one_in_a_folder(survey, tiny_store):
-    here, there = romandask.open(tiny_store), romandask.open(survey)
-    assert repr(there).replace(survey, str(tiny_store)) == repr(here)
+def test_a_survey_in_a_bucket_is_read_and_verified_like_a_local_one(survey, tiny_store):
+    local, remote = romandask.open(tiny_store), romandask.open(survey)
+    assert repr(remote).replace(survey, str(tiny_store)) == repr(local)
     window = {"tile": 0, "y": slice(100, 140), "x": slice(100, 140)}
-    for one in ("roman", "rubin"):
-        first, second = (s.coadds(one)["image"].isel(window).compute() for s in (here, there))
+    for instrument in ("roman", "rubin"):
+        first, second = (s.coadds(instrument)["image"].isel(window).compute() for s in (local, remote))
         np.testing.assert_array_equal(first, second)
-    pd.testing.assert_frame_equal(here.objects("roman").compute(), there.objects("roman").compute())
+    pd.testing.assert_frame_equal(local.objects("roman").compute(), remote.objects("roman").compute())
     catalog = pd.read_parquet(f"{survey}/objects/roman/catalog/dataset", columns=["objectId"])
-    assert len(catalog) == len(here.objects("roman"))
+    assert len(catalog) == len(local.objects("roman"))
     done = command("verify", survey)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "units are as they were written" in done.stdout
 
 
-def test_what_is_damaged_in_a_bucket_is_found_and_made_again_to_the_byte(survey, tiny_store, tmp_path):
-    there = parse_path(survey)
-    chunk = next(path for path in files_below(there / "coadds/rubin.zarr/image") if path.name != "zarr.json")
-    table = next(path for path in files_below(there / "objects/roman/catalog/dataset") if path.name.startswith("Npix"))
+def test_damaged_units_in_a_bucket_are_found_and_made_again_identically(survey, tiny_store, tmp_path):
+    root = parse_path(survey)
+    chunk = next(path for path in files_below(root / "coadds/rubin.zarr/image") if path.name != "zarr.json")
+    table = next(path for path in files_below(root / "objects/roman/catalog/dataset") if path.name.startswith("Npix"))
     content = table.read_bytes()
     table.write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
     chunk.unlink()
@@ -195,21 +195,21 @@ def test_what_is_damaged_in_a_bucket_is_found_and_made_again_to_the_byte(survey,
     again = command("run", "tiny", "--store", survey, "--workers", "1", cwd=tmp_path)
     assert again.returncode == 0, again.stdout + again.stderr
     assert table.read_bytes() == content
-    found, expected = (
+    outputs, expected = (
         {(stage, name): record.output for stage in store.stages() for name, record in read_records(store, stage)}
-        for store in (Store(there), Store(tiny_store))
+        for store in (Store(root), Store(tiny_store))
     )
-    assert found == expected
-    assert (there / "report/index.html").read_bytes().startswith(b"<!doctype html>")
+    assert outputs == expected
+    assert (root / "report/index.html").read_bytes().startswith(b"<!doctype html>")
     assert "it ended (done)" in command("status", survey).stdout
 
 
-def test_a_pipeline_and_its_sources_are_read_from_a_bucket(bucket, shared, tmp_path):
+def test_a_pipeline_and_its_sources_can_be_in_a_bucket(bucket, shared, tmp_path):
     source = shared / "skycatalogs_sample"
     upload(source, f"{bucket}/sky")
     counts = []
-    for where, store in ((str(source), tmp_path / "here"), (f"{bucket}/sky", tmp_path / "there")):
-        done = command("ingest", "skycatalogs", where, "--store", str(store), "--seds", str(shared / "seds"))
+    for path, store in ((str(source), tmp_path / "local"), (f"{bucket}/sky", tmp_path / "remote")):
+        done = command("ingest", "skycatalogs", path, "--store", str(store), "--seds", str(shared / "seds"))
         assert done.returncode == 0, done.stdout + done.stderr
         counts.append(done.stdout.splitlines()[-1])
     assert counts[0] == counts[1]
@@ -220,7 +220,7 @@ def test_a_pipeline_and_its_sources_are_read_from_a_bucket(bucket, shared, tmp_p
     assert command("plan", f"{bucket}/p.yaml").returncode == 0
 
 
-def test_every_kind_of_source_reads_the_same_from_a_bucket(bucket, shared):
+def test_every_source_format_reads_the_same_from_a_bucket(bucket, shared):
     upload(shared / "dc2_instance_catalog", f"{bucket}/dc2")
     for name in ("opsim", "roman_obseq"):
         upload(shared / name, f"{bucket}/{name}")
@@ -232,23 +232,23 @@ def test_every_kind_of_source_reads_the_same_from_a_bucket(bucket, shared):
     name = next(
         path.name for path in sorted((shared / "dc2_instance_catalog").iterdir()) if path.name.startswith("example")
     )
-    here, there = (
+    local, remote = (
         instance_catalog.open_source(folder / name)
         for folder in (shared / "dc2_instance_catalog", parse_path(f"{bucket}/dc2"))
     )
-    assert [batch.name for batch in here.batches()] == [batch.name for batch in there.batches()]
-    for first, second in zip(here.batches(), there.batches(), strict=True):
-        pd.testing.assert_frame_equal(here.read(first), there.read(second))
+    assert [batch.name for batch in local.batches()] == [batch.name for batch in remote.batches()]
+    for first, second in zip(local.batches(), remote.batches(), strict=True):
+        pd.testing.assert_frame_equal(local.read(first), remote.read(second))
 
 
-def test_what_cannot_be_reached_is_told_in_one_line(bucket, monkeypatch):
-    cases = [
+def test_an_unreachable_store_is_reported_in_one_line(bucket, monkeypatch):
+    commands = [
         ("status", "s3://nobucket/tiny"),
         ("run", "tiny", "--store", "s3://nobucket/tiny"),
         ("plan", "s3://no/p.yaml"),
     ]
-    for case in cases:
-        done = command(*case)
+    for arguments in commands:
+        done = command(*arguments)
         assert done.returncode == 2, done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
         assert done.stderr.startswith("error: s3://no")

@@ -1,7 +1,8 @@
-"""What is written is read back, whole, and damage is found."""
+"""Products, records and locks of a store: what is written is read back, and damage is detected."""
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,44 +25,54 @@ from romandask.storage.store import Store, read_parquet, write_parquet
 PLANE = Variable("image", "float32", (64, 48), ("y", "x"), {"units": "nJy"})
 
 
-def images(count: int) -> ImageProduct:
+def image_product(count: int) -> ImageProduct:
+    """Return an image product of `count` units, each an image of random values."""
+
     def make(index):
         return {"image": np.random.default_rng(index).normal(size=(64, 48)).astype(np.float32)}
 
     units = tuple(Unit(f"u{k}", k) for k in range(count))
     names = np.array([f"u{k}" for k in range(count)], object)
     coordinates = {"exposure": (("exposure",), names, {})}
-    return ImageProduct("exposures/x", units, make, (PLANE,), ("exposure",), (count,), lambda: coordinates)
+    return ImageProduct(
+        stage="exposures/x",
+        units=units,
+        make=make,
+        variables=(PLANE,),
+        axes=("exposure",),
+        lengths=(count,),
+        coordinates=lambda: coordinates,
+    )
 
 
-def test_images_come_back_and_grow_with_their_units(tmp_path):
+def test_images_are_read_back_and_arrays_grow_with_the_number_of_units(tmp_path):
     store = Store(tmp_path)
-    images(3).prepare(store)
-    first = images(3).write(1, store)
-    images(5).prepare(store)
-    images(5).write(4, store)
+    image_product(3).prepare(store)
+    first = image_product(3).write(1, store)
+    image_product(5).prepare(store)
+    image_product(5).write(4, store)
     array = zarr.open_group(store.images("exposures/x"), mode="r")["image"]
     assert array.shape == (5, 64, 48)
-    np.testing.assert_array_equal(array[1], images(3).make(1)["image"])
-    np.testing.assert_array_equal(array[4], images(3).make(4)["image"])
-    assert first.output == digest({"image": digest(images(3).make(1)["image"])})
+    np.testing.assert_array_equal(array[1], image_product(3).make(1)["image"])
+    np.testing.assert_array_equal(array[4], image_product(3).make(4)["image"])
+    assert first.output == digest({"image": digest(image_product(3).make(1)["image"])})
 
 
-def test_a_unit_is_read_only_when_its_record_says_that_it_is_done(tmp_path):
+def test_a_unit_without_a_record_is_made_although_its_data_are_stored(tmp_path):
     store = Store(tmp_path)
-    product = images(2).stored(store)
+    product = image_product(2).stored(store)
     product.prepare(store)
     product.write(0, store)
     group = zarr.open_group(store.images("exposures/x"), mode="r+")
     group["image"][0] = 7.0
-    np.testing.assert_array_equal(product.load(0)["image"], images(2).make(0)["image"])
+    np.testing.assert_array_equal(product.load(0)["image"], image_product(2).make(0)["image"])
     write_record(store, Record("exposures/x", "u0", "", "", 0, 0, 0.0, 0))
     assert (product.load(0)["image"] == 7.0).all()
 
 
-def test_a_damaged_chunk_is_told_with_its_remedy(tmp_path):
+def test_a_damaged_chunk_is_reported_with_the_remedy(tmp_path):
     store = Store(tmp_path)
-    product = images(2).stored(store)
+    product = image_product(2).stored(store)
     product.prepare(store)
     product.write(1, store)
     path = next(path for path in store.images("exposures/x").rglob("image/c/1/**/*") if path.is_file())
@@ -74,17 +85,17 @@ def test_a_damaged_chunk_is_told_with_its_remedy(tmp_path):
 
 def test_values_that_are_not_finite_are_never_written(tmp_path):
     store = Store(tmp_path)
-    product = images(1)
+    product = image_product(1)
     product.prepare(store)
-    bad = ImageProduct(**{**vars(product), "make": lambda k: {"image": np.full((64, 48), np.nan, np.float32)}})
+    bad = replace(product, make=lambda k: {"image": np.full((64, 48), np.nan, np.float32)})
     with pytest.raises(ValueError, match="not finite"):
         bad.write(0, store)
 
 
-def test_what_a_maker_keeps_stays_its_own(tmp_path):
-    """Written to two stores by one process, the matter of a universe for example, which is made once."""
+def test_writing_does_not_change_the_dictionary_that_make_returns(tmp_path):
+    """A maker may keep its result, such as the matter of a universe, and one process may write it to two stores."""
     kept = {"image": np.ones((64, 48), np.float32)}
-    product = ImageProduct(**{**vars(images(1)), "make": lambda k: kept})
+    product = replace(image_product(1), make=lambda k: kept)
     for name in ("one", "two"):
         store = Store(tmp_path / name)
         product.prepare(store)
@@ -92,20 +103,20 @@ def test_what_a_maker_keeps_stays_its_own(tmp_path):
         assert list(kept) == ["image"]
 
 
-@pytest.mark.parametrize("position", [0.2, 0.5, 0.8])
-def test_a_flipped_byte_of_an_image_is_found_when_read(tmp_path, position):
+@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.8])
+def test_a_flipped_byte_of_an_image_is_an_error_on_reading(tmp_path, fraction):
     store = Store(tmp_path)
-    images(1).prepare(store)
-    images(1).write(0, store)
+    image_product(1).prepare(store)
+    image_product(1).write(0, store)
     (shard,) = [path for path in (store.images("exposures/x") / "image" / "c").rglob("*") if path.is_file()]
     content = bytearray(shard.read_bytes())
-    content[int(len(content) * position)] ^= 0x10
+    content[int(len(content) * fraction)] ^= 0x10
     shard.write_bytes(content)
     with pytest.raises((ValueError, RuntimeError)):
         zarr.open_group(store.images("exposures/x"), mode="r")["image"][0]
 
 
-def test_a_flipped_byte_of_a_table_is_found_when_read(tmp_path):
+def test_a_flipped_byte_of_a_table_is_an_error_on_reading(tmp_path):
     path = tmp_path / "t.parquet"
     write_parquet(path, pa.table({"a": np.random.default_rng(0).normal(size=5000)}))
     content = bytearray(path.read_bytes())
@@ -115,7 +126,7 @@ def test_a_flipped_byte_of_a_table_is_found_when_read(tmp_path):
         read_parquet(path)
 
 
-def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_files_are_written_atomically(tmp_path, monkeypatch):
     write_bytes(tmp_path / "f", b"old")
 
     def fail(*arguments):
@@ -127,7 +138,7 @@ def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
     assert (tmp_path / "f").read_bytes() == b"old"
 
 
-def test_records_come_back_and_damaged_ones_count_as_none(tmp_path):
+def test_records_are_read_back_and_damaged_ones_are_ignored(tmp_path):
     store = Store(tmp_path)
     record = Record("a/b", "u", "in", "out", 1, 2, 3.0, 4, ["w"])
     write_record(store, record)
@@ -136,14 +147,14 @@ def test_records_come_back_and_damaged_ones_count_as_none(tmp_path):
     assert read_record(store, "a/b", "u") is None
 
 
-def test_digests_tell_values_types_and_shapes_apart():
+def test_digests_depend_on_values_types_and_shapes():
     arrays = [np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.float32), np.ones(4)]
     assert len({digest(array) for array in arrays}) == 4
     assert digest({"b": 1, "a": 2}) == digest({"a": 2, "b": 1})
     assert digest("ab", "c") != digest("a", "bc")
 
 
-def test_tables_keep_to_their_schema():
+def test_tables_conform_to_their_schema():
     schema = pa.schema([pa.field("a", pa.int64()), pa.field("b", pa.float32())])
     assert conform(pd.DataFrame({"b": [1.0], "a": [2], "c": [3]}), schema, "t").column_names == ["a", "b"]
     with pytest.raises(UserError, match="t: column 'b' is missing"):
@@ -152,19 +163,21 @@ def test_tables_keep_to_their_schema():
         conform(pd.DataFrame({"a": [1.5], "b": [1.0]}), schema, "t")
 
 
-def test_a_lazy_table_is_its_units(tmp_path):
+def test_the_lazy_table_has_the_rows_of_all_units(tmp_path):
     schema = pa.schema([pa.field("a", pa.int64())])
-    product = TableProduct("t", (Unit("0", 0), Unit("1", 1)), lambda k: pd.DataFrame({"a": [k, k + 10]}), schema)
+    product = TableProduct(
+        stage="t", units=(Unit("0", 0), Unit("1", 1)), make=lambda k: pd.DataFrame({"a": [k, k + 10]}), schema=schema
+    )
     assert product.frame.compute(scheduler="synchronous")["a"].tolist() == [0, 10, 1, 11]
 
 
 def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(tmp_path):
     with locked(tmp_path):
-        held = json.loads((tmp_path / ".lock").read_text())
-        (tmp_path / ".lock").write_text(json.dumps(held | {"pid": 1}))
+        holder = json.loads((tmp_path / ".lock").read_text())
+        (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 1}))
         with pytest.raises(UserError, match="another driver"), locked(tmp_path):
             pass
-    (tmp_path / ".lock").write_text(json.dumps(held | {"pid": 2**22 + 1}))
+    (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 2**22 + 1}))
     with locked(tmp_path):
         assert (tmp_path / ".lock").exists()
     assert not (tmp_path / ".lock").exists()
@@ -179,31 +192,31 @@ def test_a_store_that_cannot_be_written_is_refused(tmp_path):
         Store(Path(tmp_path / "file" / "store")).prepare()
 
 
-def test_lazy_units_are_worked_out_when_asked_for_and_travel_as_names():
-    asked = []
+def test_lazy_units_are_constructed_on_access_and_serialised_as_names():
+    constructed = []
 
     def make(index):
-        asked.append(index)
+        constructed.append(index)
         return Unit(f"u{index}", {"index": index})
 
     units = LazyUnits(("u0", "u1", "u2"), make)
     assert names_of(units) == ("u0", "u1", "u2")
-    assert asked == []
+    assert constructed == []
     assert units[-1].settings == {"index": 2}
     assert [unit.name for unit in units[:2]] == ["u0", "u1"]
-    assert asked == [2, 0, 1]
-    there = pickle.loads(pickle.dumps(units))
-    assert names_of(there) == names_of(units)
-    with pytest.raises(RuntimeError, match="worked out where"):
-        there[0]
+    assert constructed == [2, 0, 1]
+    copy = pickle.loads(pickle.dumps(units))
+    assert names_of(copy) == names_of(units)
+    with pytest.raises(RuntimeError, match="serialised as names only"):
+        copy[0]
 
 
-def test_rows_between_cells_are_read_from_the_file_alone_that_may_hold_them(tmp_path):
+def test_a_range_of_cells_is_read_from_a_file_with_several_row_groups(tmp_path):
     path = tmp_path / "t.parquet"
     cells = np.arange(0, 4_000_000, 20)
     write_parquet(path, pa.table({"_healpix_29": cells, "x": cells * 2.0, "y": cells * 0.0}))
     assert pq.ParquetFile(path).metadata.num_row_groups == 4
-    found = read_parquet(path, ["x"], (1_000_010, 1_000_100))
-    assert found.column_names == ["x"]
-    np.testing.assert_array_equal(found["x"].to_numpy() / 2, [1_000_020, 1_000_040, 1_000_060, 1_000_080])
+    rows = read_parquet(path, ["x"], (1_000_010, 1_000_100))
+    assert rows.column_names == ["x"]
+    np.testing.assert_array_equal(rows["x"].to_numpy() / 2, [1_000_020, 1_000_040, 1_000_060, 1_000_080])
     assert read_parquet(path, None, (9_000_000, 9_000_001)).num_rows == 0

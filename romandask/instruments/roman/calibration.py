@@ -122,13 +122,13 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
 
     maker = MakeCalibration(source, tuple(scas))
     return ImageProduct(
-        "calibration/roman",
-        units,
-        maker,
-        VARIABLES,
-        ("sca",),
-        (len(scas),),
-        coordinates,
+        stage="calibration/roman",
+        units=units,
+        make=maker,
+        variables=VARIABLES,
+        axes=("sca",),
+        lengths=(len(scas),),
+        coordinates=coordinates,
         # the largest plane as it is made or read, and as it is stored
         bytes_per_unit=1300 << 20,
         seconds_per_unit=15.0,

@@ -102,10 +102,10 @@ def statistics(found: Matches, shifted: Matches, samples: Samples, lengths: tupl
         products = (groups.groups, groups.merged, *(one.table for one in samples.both), samples.galaxies, samples.stars)
         upstream = tuple((product.stage, unit) for product in products for unit in product.names)
         return TableProduct(
-            f"statistics/{name}",
-            (Unit("all", state, upstream),),
-            kind(groups, samples, lengths),
-            schema(columns or name),
+            stage=f"statistics/{name}",
+            units=(Unit("all", state, upstream),),
+            make=kind(groups, samples, lengths),
+            schema=schema(columns or name),
             bytes_per_unit=500 << 20,
         )
 

@@ -100,42 +100,42 @@ def matches(
         shift=dict(shift),
     )
     local = TableProduct(
-        f"{kind}/local",
-        tuple(Unit(name, state, parts.inputs(cell)) for name, cell in zip(names, cells, strict=True)),
-        _Local(parts),
-        schema("local"),
-        cells,
-        settings.order,
-        size,
+        stage=f"{kind}/local",
+        units=tuple(Unit(name, state, parts.inputs(cell)) for name, cell in zip(names, cells, strict=True)),
+        make=_Local(parts),
+        schema=schema("local"),
+        pixels=cells,
+        order=settings.order,
+        bytes_per_unit=size,
         store=store,
     )
     crossing = TableProduct(
-        f"{kind}/crossing",
-        tuple(Unit(name, state, parts.inputs(cell, True)) for name, cell in zip(names, cells, strict=True)),
-        _Crossing(parts),
-        schema("crossing"),
+        stage=f"{kind}/crossing",
+        units=tuple(Unit(name, state, parts.inputs(cell, True)) for name, cell in zip(names, cells, strict=True)),
+        make=_Crossing(parts),
+        schema=schema("crossing"),
         bytes_per_unit=size,
         store=store,
     )
     upstream = tuple((product.stage, unit.name) for product in (local, crossing) for unit in product.units)
     merged = TableProduct(
-        f"{kind}/merged",
-        (Unit("all", state, upstream),),
-        _Merge(local, crossing),
-        schema("merged"),
+        stage=f"{kind}/merged",
+        units=(Unit("all", state, upstream),),
+        make=_Merge(local, crossing),
+        schema=schema("merged"),
         bytes_per_unit=size,
         store=store,
     )
     groups = TableProduct(
-        f"{kind}/groups",
-        tuple(
+        stage=f"{kind}/groups",
+        units=tuple(
             Unit(name, {**state, "lengths": lengths}, ((local.stage, name), (merged.stage, "all"))) for name in names
         ),
-        _Name(local, merged, {codes[name]: name for name in objects}, lengths),
-        schema("groups", columns),
-        cells,
-        settings.order,
-        size,
+        make=_Name(local, merged, {codes[name]: name for name in objects}, lengths),
+        schema=schema("groups", columns),
+        pixels=cells,
+        order=settings.order,
+        bytes_per_unit=size,
         store=store,
     )
     return Matches(local, crossing, merged, groups)

@@ -37,7 +37,9 @@ def limits(objects: TableProduct, matched: TableProduct, settings: MatchSettings
     told = np.inf if settings.sample == "all" else limit
     sources = () if told is not None else tuple((p.stage, name) for p in (objects, matched) for name in p.names)
     maker = _Limit(_Clean(objects, matched, (band,)), told, band)
-    return TableProduct(stage, (Unit("all", state, sources),), maker, schema("limits"), bytes_per_unit=400 << 20)
+    return TableProduct(
+        stage=stage, units=(Unit("all", state, sources),), make=maker, schema=schema("limits"), bytes_per_unit=400 << 20
+    )
 
 
 def samples(
@@ -67,13 +69,13 @@ def samples(
         return Unit(objects.names[index], state, ((objects.stage, objects.names[index]), *tables, (limit.stage, "all")))
 
     return TableProduct(
-        f"samples/{objects.stage.split('/')[1]}",
-        LazyUnits(objects.names, unit),
-        _Sample(_Clean(objects, matched, bands), limit, settings.sample, band),
-        schema("samples", bands),
-        objects.pixels,
-        objects.order,
-        objects.bytes_per_unit,
+        stage=f"samples/{objects.stage.split('/')[1]}",
+        units=LazyUnits(objects.names, unit),
+        make=_Sample(_Clean(objects, matched, bands), limit, settings.sample, band),
+        schema=schema("samples", bands),
+        pixels=objects.pixels,
+        order=objects.order,
+        bytes_per_unit=objects.bytes_per_unit,
     )
 
 

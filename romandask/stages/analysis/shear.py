@@ -74,31 +74,31 @@ def lensing(
     name, state = sample.stage.split("/")[1], {"settings": settings.model_dump(), "region": vars(region)}
     own = tuple((product.stage, unit) for product in (sample, galaxies) for unit in product.names)
     shaped = TableProduct(
-        f"shapes/{name}",
-        tuple(Unit(unit, {"sample": unit}, own) for unit in sample.names),
-        MeasureShapes(sample, galaxies),
-        schema("shapes"),
-        sample.pixels,
-        sample.order,
+        stage=f"shapes/{name}",
+        units=tuple(Unit(unit, {"sample": unit}, own) for unit in sample.names),
+        make=MeasureShapes(sample, galaxies),
+        schema=schema("shapes"),
+        pixels=sample.pixels,
+        order=sample.order,
         bytes_per_unit=400 << 20,
         store=store,
     )
     boxes = patches(region, settings.patches) if len(separations(settings, region)) > 1 else []
     sources = tuple((shaped.stage, unit) for unit in shaped.names)
     pairs = TableProduct(
-        f"shear_pairs/{name}",
-        tuple(Unit(f"{k}", {**state, "patch": k}, sources) for k in range(len(boxes))),
-        CountPairs(shaped, settings, region),
-        schema("pairs"),
+        stage=f"shear_pairs/{name}",
+        units=tuple(Unit(f"{k}", {**state, "patch": k}, sources) for k in range(len(boxes))),
+        make=CountPairs(shaped, settings, region),
+        schema=schema("pairs"),
         bytes_per_unit=700 << 20,
         store=store,
     )
     counted = tuple((pairs.stage, unit) for unit in pairs.names)
     found = TableProduct(
-        f"shear/{name}",
-        (Unit("all", state, sources + counted),),
-        MeasureShear(shaped, pairs, settings, region),
-        schema("shear"),
+        stage=f"shear/{name}",
+        units=(Unit("all", state, sources + counted),),
+        make=MeasureShear(shaped, pairs, settings, region),
+        schema=schema("shear"),
         bytes_per_unit=500 << 20,
         store=store,
     )

@@ -28,10 +28,10 @@ def zero_points(summary: TableProduct, detections: Detections) -> TableProduct:
     sources = tuple((product.stage, name) for product in (summary, detections) for name in product.names)
     name, bands = detections.instrument.name, detections.instrument.bands
     return TableProduct(
-        f"zero_points/{name}",
-        (Unit("all", {"bands": bands, "limits": [BRIGHT, FAINT]}, optional=sources),),
-        MakeZeroPoints(summary, detections, bands),
-        schema("zero_points"),
+        stage=f"zero_points/{name}",
+        units=(Unit("all", {"bands": bands, "limits": [BRIGHT, FAINT]}, optional=sources),),
+        make=MakeZeroPoints(summary, detections, bands),
+        schema=schema("zero_points"),
         bytes_per_unit=400 << 20,
     )
 

@@ -155,7 +155,9 @@ def _generated(
     return TruthCatalogs(
         _kept(table("galaxies", GenerateGalaxies(*common, field), state[0], ((field.stage, "all"),)), store),
         _kept(table("stars", GenerateStars(*common), state[1], ()), store),
-        _kept(TableProduct("truth/quarantine", (), NothingSetAside(), schema("quarantine")), store),
+        _kept(
+            TableProduct(stage="truth/quarantine", units=(), make=NothingSetAside(), schema=schema("quarantine")), store
+        ),
         field,
         None,
         spectra.library,
@@ -197,10 +199,10 @@ def _from_sources(
     per_batch = [Unit(unit.name, state, ((rows.stage, unit.name),)) for unit in rows.units]
     per_cell = [Unit(f"cell-{unit.name}", state, inputs) for unit in galaxies.units]
     quarantine = TableProduct(
-        "truth/quarantine",
-        (*per_batch, *per_cell),
-        Quarantine(makers["galaxy"]),
-        schema("quarantine"),
+        stage="truth/quarantine",
+        units=(*per_batch, *per_cell),
+        make=Quarantine(makers["galaxy"]),
+        schema=schema("quarantine"),
         bytes_per_unit=max(rows.bytes_per_unit, galaxies.bytes_per_unit),
     )
     stars = _kept(table("stars", makers["star"], state, inputs), store)
@@ -228,7 +230,14 @@ def _tables(
         pixels = tuple(map(int, cells))
         seconds = cell_area(settings.order) * density * 1.1e-5
         return TableProduct(
-            f"truth/{kind}", units, make, schema(kind, bands), pixels, settings.order, per_cell, seconds
+            stage=f"truth/{kind}",
+            units=units,
+            make=make,
+            schema=schema(kind, bands),
+            pixels=pixels,
+            order=settings.order,
+            bytes_per_unit=per_cell,
+            seconds_per_unit=seconds,
         )
 
     return table

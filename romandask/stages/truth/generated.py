@@ -104,14 +104,14 @@ def matter(settings: TruthSettings, region: Region, seed: int) -> ImageProduct:
     }
     state = {"nside": settings.nside, "seed": seed, "pixels": digest(pixels)}
     return ImageProduct(
-        "truth/structure",
-        (Unit("all", state),),
-        _MakeMatter(settings.nside, tuple(pixels.tolist()), seed),
-        planes,
-        ("universe",),
-        (1,),
-        lambda: coordinates,
-        {"nside": settings.nside},
+        stage="truth/structure",
+        units=(Unit("all", state),),
+        make=_MakeMatter(settings.nside, tuple(pixels.tolist()), seed),
+        variables=planes,
+        axes=("universe",),
+        lengths=(1,),
+        coordinates=lambda: coordinates,
+        attributes={"nside": settings.nside},
         bytes_per_unit=bytes_of(settings.nside) + 10 * 4 * count * len(pixels),
         seconds_per_unit=5 + 2e-4 * settings.nside**2,
     )

@@ -61,7 +61,11 @@ def ingested_rows(sources: tuple[Source, ...]) -> TableProduct:
         for name, (number, batch) in zip(names, pairs, strict=True)
     )
     return TableProduct(
-        "truth/ingested", units, _ReadBatch(sources, pairs), schema("ingested"), bytes_per_unit=_BATCH_BYTES
+        stage="truth/ingested",
+        units=units,
+        make=_ReadBatch(sources, pairs),
+        schema=schema("ingested"),
+        bytes_per_unit=_BATCH_BYTES,
     )
 
 

@@ -41,7 +41,7 @@ def catalog(stage: str, frame: pd.DataFrame, columns: pa.Schema, position=("coor
     parts = [full[owner == cell].reset_index(drop=True) for cell in cells]
     assert sum(map(len, parts)) == len(frame)
     units = tuple(Unit(str(cell), cell, (("detections/x", "tile"),)) for cell in cells)
-    return TableProduct(stage, units, lambda k: parts[k], columns, cells, ORDER)
+    return TableProduct(stage=stage, units=units, make=lambda k: parts[k], schema=columns, pixels=cells, order=ORDER)
 
 
 def survey_of(rows: list[dict], bands: tuple[str, ...], name: str) -> tuple[TableProduct, TableProduct]:
@@ -56,7 +56,12 @@ def survey_of(rows: list[dict], bands: tuple[str, ...], name: str) -> tuple[Tabl
         **columns,
     )
     table = frame[["objectId", "truth_id"]].assign(star=False)
-    matched = TableProduct("truth_match/" + name, (Unit("tile", 0),), lambda k: _filled(table), schema("truth_match"))
+    matched = TableProduct(
+        stage="truth_match/" + name,
+        units=(Unit("tile", 0),),
+        make=lambda k: _filled(table),
+        schema=schema("truth_match"),
+    )
     return catalog(f"objects/{name}", frame, schema("objects", bands)), matched
 
 

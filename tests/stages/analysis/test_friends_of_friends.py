@@ -80,7 +80,12 @@ def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
     parts = [full[owner == cell].reset_index(drop=True) for cell in cells]
     assert sum(map(len, parts)) == len(frame)
     return TableProduct(
-        f"objects/{name}", tuple(Unit(str(c), c) for c in cells), lambda k: parts[k], columns, cells, order
+        stage=f"objects/{name}",
+        units=tuple(Unit(str(c), c) for c in cells),
+        make=lambda k: parts[k],
+        schema=columns,
+        pixels=cells,
+        order=order,
     )
 
 

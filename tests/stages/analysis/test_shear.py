@@ -183,7 +183,9 @@ def test_the_sample_is_the_galaxies_that_objects_have_as_counterparts(small):
     ]
     columns = pa.schema([("truth_id", pa.int64()), ("star", pa.bool_()), ("_healpix_29", pa.int64())])
     units = tuple(Unit(str(cell), cell) for cell in cells)
-    sample = TableProduct("samples/roman", units, lambda k: parts[k], columns, cells, order)
+    sample = TableProduct(
+        stage="samples/roman", units=units, make=lambda k: parts[k], schema=columns, pixels=cells, order=order
+    )
     maker = MeasureShapes(sample, small.truth.galaxies)
     found = pd.concat([maker(k) for k in range(len(units))])
     assert sorted(found["galaxy_id"]) == sorted(some["galaxy_id"])
@@ -258,7 +260,9 @@ def test_stages_over_partitions_make_what_is_made_in_memory():
     columns = pa.schema([("truth_id", pa.int64()), ("star", pa.bool_()), ("_healpix_29", pa.int64())])
     every = frame.assign(truth_id=frame["galaxy_id"], star=False)
     parts = [every[where == cell].reset_index(drop=True) for cell in cells]
-    sample = TableProduct("samples/roman", units, lambda k: parts[k], columns, cells, order)
+    sample = TableProduct(
+        stage="samples/roman", units=units, make=lambda k: parts[k], schema=columns, pixels=cells, order=order
+    )
     stages = lensing(sample, sample, settings, region)
     made = replace(stages.shapes, make=lambda k: parts[k])
     pairs = replace(stages.pairs, make=replace(stages.pairs.make, shapes=made))

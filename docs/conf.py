@@ -27,6 +27,10 @@ numpydoc_xref_param_type = False
 html_theme = "pydata_sphinx_theme"
 html_title = "romandask"
 html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+# pages without a section have nothing to show beside them
+html_sidebars = {page: [] for page in ("quickstart", "user-guide", "pipelines", "data-products")}
+html_sidebars |= {page: [] for page in ("contributing", "changelog", "citing")}
 html_show_sourcelink = False
 html_theme_options = {
     "navbar_align": "left",

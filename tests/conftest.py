@@ -90,6 +90,8 @@ LONG = (
     "test_main.py",
     "test_verify.py",
     "test_catalogs.py",
+    "test_notebooks.py",
+    "test_commands.py",
 )
 """Files that take long; the longest single tests first."""
 

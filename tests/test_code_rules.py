@@ -4,18 +4,14 @@ import ast
 import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
-import click
 import pytest
 import yaml
 from conftest import ROOT
-from typer.main import get_command
 
-from romandask.cli.main import app
 from romandask.report.reference import reference
 
 PACKAGE = ROOT / "romandask"
@@ -134,42 +130,6 @@ def test_types_hold():
     command = [sys.executable, "-m", "mypy", *TYPED]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
-
-
-PAGES = (
-    "README.md",
-    "pipelines/README.md",
-    "pipelines/GUIDE.md",
-    "catalogs/README.md",
-    "romandask/instruments/README.md",
-)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_every_path_and_command_that_a_page_names_exists(page, tmp_path, monkeypatch):
-    text = (ROOT / page).read_text()
-    for path in re.findall(r"`((?:romandask|pipelines|catalogs|tests)/[\w./-]*)`", text):
-        assert (ROOT / path).exists(), path
-    monkeypatch.chdir(tmp_path)
-    for block in re.findall(r"```bash\n(.*?)```", text, re.S):
-        for line in block.splitlines():
-            if not line.startswith("romandask "):
-                continue
-            command, words = get_command(app), shlex.split(line, comments=True)[1:]
-            while isinstance(command, click.Group):
-                assert words[0] in command.commands, line
-                command, words = command.commands[words[0]], words[1:]
-            # what is read, options and their values, nothing is done
-            command.make_context("romandask", words)
-
-
-def test_the_python_of_the_guide_runs(tiny_store, tmp_path):
-    (tmp_path / "runs").symlink_to(tiny_store.parent)
-    text = (ROOT / "pipelines" / "GUIDE.md").read_text()
-    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.S))
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "truth/structure" in done.stdout, "the survey's repr"
 
 
 def test_the_reference_of_products_is_what_the_code_makes():

@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from romandask import Pipeline
 from romandask.cli.main import app
+from romandask.report.stage_tables import stage_table, table_locations
 
 PLAIN_TYPES = {"string": "text", "number": "number", "integer": "integer", "boolean": "true or false"}
 BOUNDS = (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
@@ -43,7 +44,12 @@ def settings() -> str:
     return "\n".join(parts)
 
 
-CONTENT = {"commands": commands, "settings": settings}
+CONTENT = {
+    "commands": commands,
+    "settings": settings,
+    "stages": stage_table,
+    "tables": table_locations,
+}
 
 
 def _section(value: Schema) -> str | None:

@@ -22,6 +22,7 @@ ROOMS = (
     "export",
     "run",
     "survey",
+    "survey_repr",
     "stage_graph",
     "stages",
     "pipeline",

@@ -33,6 +33,8 @@ from romandask.storage.manifest import digest, read_record
 from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store, read_parquet, write_parquet
 
+LONGEST_SHOWN_TEXT = 100
+"""Characters up to which a text coordinate is shown in the repr of a dataset."""
 _NO_TABLES: Mapping[str, bytes] = MappingProxyType({})
 Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
 """Axes, values and attributes of each coordinate, by name."""
@@ -260,10 +262,18 @@ class ImageProduct:
                 variable.attributes,
             )
         coordinates = {
-            key: (axes, values.astype(str) if values.dtype == object else values, attributes)
+            key: (axes, _coordinate_values(values), attributes)
             for key, (axes, values, attributes) in self.coordinates().items()
         }
         return xr.Dataset(data, coordinates, self.attributes)
+
+
+def _coordinate_values(values: np.ndarray) -> Any:
+    """Return the values of a coordinate as xarray takes them: long texts, which would fill a repr, as a lazy array."""
+    if values.dtype != object:
+        return values
+    texts = values.astype(str)
+    return da.from_array(texts, chunks=-1) if texts.dtype.itemsize > 4 * LONGEST_SHOWN_TEXT else texts
 
 
 def _evaluated(array: Any) -> Any:

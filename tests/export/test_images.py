@@ -15,8 +15,10 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from mocpy import MOC
 
-from romandask.export.images import export_fits, export_moc, export_obscore
-from romandask.export.roman_datamodels import export_asdf, export_mosaics
+from romandask.export.asdf import export_asdf
+from romandask.export.fits import export_fits
+from romandask.export.moc import export_moc
+from romandask.export.obscore import export_obscore
 from romandask.instruments.exposure import exposure_of
 from romandask.model.errors import UserError
 from romandask.stages.pointings import corners_of
@@ -70,7 +72,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
 def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
     """roman_datamodels reads and validates them; their gwcs is the FITS WCS; a star has the flux that it had."""
     product = survey.output("exposures/roman")
-    (path,) = export_asdf(survey, tmp_path, [product.names[1]])
+    (path,) = export_asdf(survey, tmp_path, [product.names[1]], [], [])
     stored, exposure = product.load(1), exposure_of(survey.pointings("roman").iloc[1])
     instrument = survey.instruments["roman"]
     with rdm.open(path) as model:
@@ -102,7 +104,7 @@ def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
 def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
     """Surface brightness, WCS, exposures by bit, and the metadata of a simulated community product."""
     tile = survey.tiles[0]
-    (path,) = export_mosaics(survey, tmp_path, [tile.name], ["H158"])
+    (path,) = export_asdf(survey, tmp_path, [], [tile.name], ["H158"])
     coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
     product = survey.output("coadds/roman")
     sets = product.load(product.names.index(f"{tile.name}-H158"), ("sets",))["sets"]

@@ -8,9 +8,13 @@ import pytest
 from conftest import command
 
 from romandask.export import sha256sums
-from romandask.export.catalogs import export_meds, export_psf, export_truth
-from romandask.export.images import export_fits, export_moc, export_obscore
-from romandask.export.roman_datamodels import export_mosaics
+from romandask.export.asdf import export_asdf
+from romandask.export.fits import export_fits
+from romandask.export.meds import export_meds
+from romandask.export.moc import export_moc
+from romandask.export.obscore import export_obscore
+from romandask.export.psf import export_psf
+from romandask.export.truth import export_truth
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
 from romandask.survey import open_survey
@@ -24,7 +28,7 @@ def exported(tiny_store, tmp_path_factory):
         survey = open_survey(tiny_store)
         tile, exposure = survey.tiles[0], survey.output("exposures/roman").names[0]
         written = export_fits(survey, out, "rubin", [], [tile.name], ["i"])
-        written += export_mosaics(survey, out, [tile.name], ["H158"])
+        written += export_asdf(survey, out, [], [tile.name], ["H158"])
         written += export_truth(survey, out)
         written += export_psf(survey, out, [exposure])
         written += export_moc(survey, out)

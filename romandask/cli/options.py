@@ -1,4 +1,7 @@
-"""Arguments that several commands have, and what they do alike; `romandask.export.options` has those of exports too."""
+"""Options that several commands share, and the handling of interrupts.
+
+Arguments that commands of `romandask export` have too are in `romandask.export.options`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images at the door: what other tools read from the files is what the store has."""
+"""Exported images: the values that other tools read from the files are those of the store."""
 
 import warnings
 
@@ -31,8 +31,8 @@ def survey(tiny_store):
         yield open_survey(tiny_store)
 
 
-def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
-    """What astropy reads is what the store has, where the WCS of the store says."""
+def test_fits_images_have_the_stored_pixels_and_valid_checksums(survey, tmp_path):
+    """astropy reads the stored pixels, with the WCS of the store."""
     roman = survey.output("exposures/roman")
     tile = survey.tiles[0].name
     (one,) = export_fits(survey, tmp_path, "roman", [roman.names[1]], [], [])
@@ -46,7 +46,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
             np.testing.assert_array_equal(hdus["DQ"].data, stored["dq"])
             assert hdus["SCI"].header["BUNIT"] == "electron"
             assert hdus["DQ"].header["BIT*"]
-            # of empty pixels ERR is the scatter (their median deviation is a whole number of electrons)
+            # the median absolute deviation of the image is a whole number of electrons, so std is used
             empty = stored["truth"] < 0.5
             scatter = float(hdus["SCI"].data[empty].std(dtype=float))
             assert scatter == pytest.approx(np.median(hdus["ERR"].data[empty]), rel=0.03)
@@ -60,7 +60,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
             coadd = survey.coadds("rubin").sel(band="i").isel(tile=0)
             np.testing.assert_array_equal(hdus["SCI"].data, coadd["image"])
             np.testing.assert_array_equal(hdus["WHT"].data, coadd["weight"])
-            # these tiles have inverse variances
+            # the weights of these tiles are inverse variances
             covered = hdus["WHT"].data > 0
             error = hdus["ERR"].data[covered] * np.sqrt(hdus["WHT"].data[covered])
             np.testing.assert_allclose(error, 1, rtol=0.02)
@@ -69,8 +69,8 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
-    """roman_datamodels reads and validates them; their gwcs is the FITS WCS; a star has the flux that it had."""
+def test_exposures_are_valid_level_2_images(survey, tmp_path):
+    """roman_datamodels reads and validates them; the gwcs is the FITS WCS; the calibration gives the flux of a star."""
     product = survey.output("exposures/roman")
     (path,) = export_asdf(survey, tmp_path, [product.names[1]], [], [])
     stored, exposure = product.load(1), exposure_of(survey.pointings("roman").iloc[1])
@@ -101,8 +101,8 @@ def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
-    """Surface brightness, WCS, exposures by bit, and the metadata of a simulated community product."""
+def test_tiles_are_valid_level_3_mosaics(survey, tmp_path):
+    """Surface brightness, WCS, bits of the exposures, and the metadata of a simulated community product."""
     tile = survey.tiles[0]
     (path,) = export_asdf(survey, tmp_path, [], [tile.name], ["H158"])
     coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
@@ -127,7 +127,7 @@ def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
         bits = {name for k, name in enumerate(names) if int(model.context[k // 32, y, x]) >> (k % 32) & 1}
         assert bits == set(sets.loc[sets["set"] == int(coadd["set"][y, x]), "exposure"])
         assert len(bits) == int(coadd["nimages"][y, x])
-        # as many electrons as light of that flux gives in the time of the exposures there
+        # number of electrons of that flux in the exposure time of the pixel
         bright = np.unravel_index(int(coadd["image"].values.argmax()), covered.shape)
         flux, number = float(coadd["image"].values[bright]), int(coadd["nimages"].values[bright])
         seconds = number * float(survey.pointings("roman")["exptime"].iloc[0])
@@ -141,7 +141,7 @@ def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
         assert model.meta.coadd_info.time_first < model.meta.coadd_info.time_last
 
 
-def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
+def test_missing_images_and_unknown_endings_are_refused(survey, tmp_path):
     with pytest.raises(UserError, match="nearest H158"):
         export_fits(survey, tmp_path / "out", "roman", ["H158-999999-1"], [], [])
     with pytest.raises(UserError, match="band 'H160'"):
@@ -151,7 +151,7 @@ def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
+def test_the_obscore_table_describes_all_images(survey, tmp_path):
     roman, rubin = survey.output("coadds/roman"), survey.output("coadds/rubin")
     exposures = survey.output("exposures/roman")
     count = export_obscore(survey, tmp_path / "images.vot")
@@ -177,7 +177,7 @@ def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
     assert len(pd.read_parquet(tmp_path / "images.parquet")) == count
 
 
-def test_maps_of_areas_hold_what_the_images_hold(survey, tmp_path):
+def test_mocs_cover_the_images_and_their_objects(survey, tmp_path):
     paths = {path.name: path for path in export_moc(survey, tmp_path)}
     roman = MOC.from_fits(paths["coadds-roman-H158.moc.fits"])
     side = survey.pipeline.coadds.grid().side / 3600

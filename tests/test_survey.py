@@ -10,7 +10,7 @@ from conftest import command
 from scipy.spatial import cKDTree
 
 import romandask as rd
-from romandask.export.catalogs import export_truth
+from romandask.export.truth import export_truth
 from romandask.ingest.spectra import galaxy_templates
 from romandask.instruments.exposure import exposure_of
 from romandask.instruments.rubin.depth import depth_map, visit_depth

@@ -20,12 +20,14 @@ from rich.live import Live  # noqa: E402
 from rich.table import Column, Table  # noqa: E402
 
 from romandask import run as running  # noqa: E402
-from romandask.cli.export import calibration_app, export_app  # noqa: E402
+from romandask.cli.calibration import calibration_app  # noqa: E402
+from romandask.cli.export import export_app  # noqa: E402
 from romandask.cli.ingest import ingest_app  # noqa: E402
-from romandask.cli.options import Overrides, Scheduler, Source, StoreArgument, StoreOption, Workers, resumable  # noqa: E402
+from romandask.cli.options import Scheduler, StoreOption, Workers, resumable  # noqa: E402
 from romandask.engine.clients import runner  # noqa: E402
 from romandask.engine.progress import Reporter, busy, duration  # noqa: E402
 from romandask.export import sha256sums  # noqa: E402
+from romandask.export.options import Overrides, Source, StoreArgument  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline  # noqa: E402
 from romandask.report.page import write_report  # noqa: E402

@@ -1,4 +1,7 @@
-"""Arguments that several commands have, and what they do alike."""
+"""Options that several commands share, and the handling of interrupts.
+
+Arguments that commands of `romandask export` have too are in `romandask.export.options`.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,6 @@ def source_place(text: str) -> AnyPath:
     return parse_path(text, "a source")
 
 
-Source = Annotated[
-    str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
-]
-Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
-]
 StoreOption = Annotated[
     Any,
     typer.Option("--store", metavar="FOLDER", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER."),
@@ -30,9 +27,6 @@ StoreOption = Annotated[
 Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
-]
-StoreArgument = Annotated[
-    Any, typer.Argument(metavar="STORE", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER.")
 ]
 Spectra = Annotated[
     Any,

@@ -1,23 +1,33 @@
-"""MEDS: multi-epoch cutouts of objects in one FITS file, filled image by image, so that no list of them is in memory.
+"""Multi-epoch cutouts of objects (MEDS), one FITS file for each band; the cutouts of one image at a time are in memory.
 
-The tables are those of https://github.com/esheldon/meds/wiki/MEDS-Format; the sky frame of the Jacobians is GalSim's
-(u to the west, v to the north), as in `galsim.des.WriteMEDS`.
+The tables follow https://github.com/esheldon/meds/wiki/MEDS-Format. The sky frame of the Jacobians is that of GalSim (u
+to the west, v to the north), as in `galsim.des.WriteMEDS`.
 """
 
 from __future__ import annotations
 
 import os
-import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import typer
+import xarray as xr
 from astropy.io import fits
 
+from romandask.export.command import export_command, report_written
+from romandask.export.files import completed, make_folder
+from romandask.export.options import Bands, Folder, StoreArgument
+from romandask.model.errors import UserError
+from romandask.model.sky import Cone
+from romandask.stages.cutouts import Wanted, located
+from romandask.survey import Survey, open_survey
+
 EMPTY = -9999
-"""What the tables hold where an object has fewer cutouts than others."""
+"""Value of table entries for cutouts that an object does not have."""
 _FIELDS = {
     "file_id": "K",
     "start_row": "K",
@@ -35,55 +45,129 @@ _FIELDS = {
     "psf_cutout_row": "D",
     "psf_cutout_col": "D",
 }
+"""Columns of object_data with one value for each cutout, and their FITS format codes."""
 _PLANES = {"image_cutouts": ">f4", "weight_cutouts": ">f4", "bmask_cutouts": ">i4", "psf": ">f4"}
-"""Extensions of pixels."""
+"""Extensions with pixels, and their dtypes."""
 
 
 @dataclass(frozen=True)
 class Catalog:
-    """What the tables of a file say of its cutouts."""
+    """Content of the tables of a MEDS file."""
 
     objects: pd.DataFrame
-    """One row an object: id, ra, dec (degrees)."""
+    """One row for each object: id, ra, dec (degrees)."""
     cutouts: pd.DataFrame
-    """One row a cutout: object (row of `objects`), image (row of `images`), x, y (pixel coordinate on the image, 0 at
-    the centre of the first pixel), column, row (of its first pixel), dudx, dudy, dvdx, dvdy (arcsec a pixel)."""
+    """One row for each cutout: object (row of `objects`), image (row of `images`), x and y (pixel coordinates of the
+    object on the image, 0 at the centre of the first pixel), column and row (first pixel of the cutout on the image),
+    dudx, dudy, dvdx, dvdy (arcsec a pixel)."""
     images: pd.DataFrame
-    """One row an image: name, magzp."""
+    """One row for each image: name, magzp (AB magnitude of one electron)."""
     size: int
-    """Pixels a side of every cutout, and of its PSF."""
+    """Side of the cutouts and of their PSFs, pixels."""
 
 
-def write(path: Path, catalog: Catalog, parts: Iterable[tuple[slice, Mapping[str, np.ndarray]]]) -> None:
+def export_meds(
+    survey: Survey, folder: Path, wanted: Wanted, bands: Sequence[str], size: int, catalog: str
+) -> list[Path]:
+    """Write cutouts of objects from all exposures of the sharpest survey, one MEDS file for each band.
+
+    Images are in electrons, without the expected background. Objects that no exposure of a band covers have no cutouts.
+
+    Parameters
+    ----------
+    survey : Survey
+        Survey, stored or not. The exposures are those of `survey.sharpest`.
+    folder : Path
+        Folder of the files.
+    wanted : sequence of int, DataFrame, Region or Cone
+        Objects: their ids, a table with columns id, ra, dec (degrees), or a part of the sky.
+    bands : sequence of str
+        Bands; all bands of the survey if empty.
+    size : int
+        Side of the cutouts, pixels; even.
+    catalog : str
+        Catalog of the objects: `truth`, or the name of a survey for its detected objects.
+
+    Returns
+    -------
+    list of Path
+        Written files.
+
+    Raises
+    ------
+    UserError
+        If an id, a band or the catalog does not exist, the size is not possible, or the folder cannot be created.
+    """
+    objects = located(wanted, survey.tables(catalog), catalog)
+    instrument = survey.instruments[survey.sharpest]
+    layers = ("image", "background", "weight", "dq", "psf")
+    cutouts = {band: survey.cutouts(objects, layers, (band,), size) for band in bands or instrument.bands}
+    make_folder(folder)
+    names = survey.output(f"exposures/{survey.sharpest}").names
+    exposure_times = dict(zip(names, survey.pointings(survey.sharpest)["exptime"], strict=True))
+    written = []
+    for band, dataset in cutouts.items():
+        units, image = np.unique(dataset["unit"].to_numpy(), return_inverse=True)
+        seconds = np.array([exposure_times[name] for name in units])
+        zero_points = 2.5 * np.log10(instrument.bandpass(band).ab_photons() * seconds)
+        jacobian = dataset["jacobian"].to_numpy()
+        columns = {name: dataset[name].to_numpy() for name in ("object", "column", "row")}
+        columns |= {name: dataset[f"{name}_image"].to_numpy() for name in ("x", "y")}
+        columns |= {name: jacobian[:, k // 2, k % 2] for k, name in enumerate(("dudx", "dudy", "dvdx", "dvdy"))}
+        tables = Catalog(
+            objects,
+            pd.DataFrame(columns | {"image": image}),
+            pd.DataFrame({"name": units, "magzp": zero_points}),
+            size,
+        )
+        path = folder / f"meds-{band}.fits"
+        write_meds(path, tables, _parts(dataset))
+        written.append(path)
+    return written
+
+
+def _parts(dataset: xr.Dataset) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """Yield the planes of the cutouts of one exposure after another."""
+    stop = 0
+    for count in dataset["image"].chunksizes["cutout"] if dataset.sizes["cutout"] else ():
+        rows, stop = slice(stop, stop + count), stop + count
+        part = dataset.isel(cutout=rows).load()
+        planes = {name: part[name].to_numpy() for name in ("weight", "dq", "psf")}
+        # beyond the edge of an image both terms are 0
+        yield rows, planes | {"image": (part["image"] - part["background"]).to_numpy()}
+
+
+def write_meds(path: Path, catalog: Catalog, parts: Iterable[tuple[slice, Mapping[str, np.ndarray]]]) -> None:
     """Write a MEDS file.
 
     Parameters
     ----------
-    parts : some rows of `catalog.cutouts` at a time with their planes (n, size, size): image, weight, dq, psf
+    path : Path
+        FITS file. It appears under its name when it is complete.
+    catalog : Catalog
+        Content of the tables.
+    parts : iterable of (slice, mapping)
+        Rows of `catalog.cutouts` with their planes image, weight, dq and psf, shape (n, size, size); every row once.
     """
     order = np.lexsort((catalog.cutouts["image"], catalog.cutouts["object"]))
-    # where in the file's order each cutout is
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-    try:
-        offsets = _prepare(temporary, _tables(catalog, order), len(order) * catalog.size**2)
+    # position of each cutout in the file
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    with completed(path) as temporary:
+        offsets = _write_headers(temporary, _tables(catalog, order), len(order) * catalog.size**2)
         shape = (len(order), catalog.size, catalog.size)
-        planes = {
-            name: np.memmap(temporary, kind, "r+", offsets[name], shape) for name, kind in _PLANES.items() if len(order)
-        }
+        # a memory map cannot be empty
+        extensions = _PLANES if len(order) else {}
+        planes = {n: np.memmap(temporary, dtype, "r+", offsets[n], shape) for n, dtype in extensions.items()}
         for rows, values in parts:
             for name, layer in zip(_PLANES, ("image", "weight", "dq", "psf"), strict=True):
-                planes[name][place[rows]] = values[layer]
+                planes[name][rank[rows]] = values[layer]
         for plane in planes.values():
             plane.flush()
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _tables(catalog: Catalog, order: np.ndarray) -> list[fits.BinTableHDU]:
-    """Return object_data, image_info and metadata."""
+    """Return the tables object_data, image_info and metadata, with the cutouts in the order of the file."""
     objects, cutouts, size = catalog.objects, catalog.cutouts.iloc[order], catalog.size
     owner = cutouts["object"].to_numpy()
     count = np.bincount(owner, minlength=len(objects))
@@ -107,7 +191,7 @@ def _tables(catalog: Catalog, order: np.ndarray) -> list[fits.BinTableHDU]:
         "psf_cutout_row": middle,
         "psf_cutout_col": middle,
     }
-    # MEDS readers take a column of one value for a scalar
+    # MEDS readers take a column with one value a row for a scalar
     width = max(int(count.max(initial=0)), 2)
     columns = [
         fits.Column("id", "K", array=objects["id"].to_numpy()),
@@ -118,10 +202,10 @@ def _tables(catalog: Catalog, order: np.ndarray) -> list[fits.BinTableHDU]:
         fits.Column("psf_box_size", "K", array=np.full(len(objects), size)),
         fits.Column("ncutout", "K", array=count),
     ]
-    for name, kind in _FIELDS.items():
-        table = np.full((len(objects), width), EMPTY, np.int64 if kind == "K" else np.float64)
+    for name, code in _FIELDS.items():
+        table = np.full((len(objects), width), EMPTY, np.int64 if code == "K" else np.float64)
         table[owner, number] = np.asarray(values[name])
-        columns.append(fits.Column(name, f"{width}{kind}", array=table))
+        columns.append(fits.Column(name, f"{width}{code}", array=table))
     images = catalog.images
     names = np.array([*images["name"]], "S")
     blank = np.zeros(len(images), np.int64)
@@ -143,21 +227,47 @@ def _tables(catalog: Catalog, order: np.ndarray) -> list[fits.BinTableHDU]:
     ]
 
 
-def _prepare(path: Path, tables: list[fits.BinTableHDU], pixels: int) -> dict[str, int]:
-    """Write the tables and the headers of the pixels, and return where the pixels of each extension begin, bytes."""
+def _write_headers(path: Path, tables: list[fits.BinTableHDU], n_pixels: int) -> dict[str, int]:
+    """Write the tables and the headers of the extensions with pixels.
+
+    Returns
+    -------
+    dict of str to int
+        Offset of the pixels of each extension in the file, bytes.
+    """
     fits.HDUList([fits.PrimaryHDU(), *tables]).writeto(path)
     offsets = {}
     with open(path, "r+b") as file:
-        for name, kind in _PLANES.items():
+        for name, dtype in _PLANES.items():
             file.seek(0, os.SEEK_END)
             header = fits.Header()
             header["XTENSION"] = "IMAGE"
-            header["BITPIX"] = -32 if kind == ">f4" else 32
-            header["NAXIS"], header["NAXIS1"] = 1, pixels
+            header["BITPIX"] = -32 if dtype == ">f4" else 32
+            header["NAXIS"], header["NAXIS1"] = 1, n_pixels
             header["PCOUNT"], header["GCOUNT"] = 0, 1
             header["EXTNAME"] = name
             file.write(header.tostring().encode())
             offsets[name] = file.tell()
-            # blocks of 2880 bytes, zeros that take no disk until they are filled
-            file.truncate(offsets[name] + -(-pixels * 4 // 2880) * 2880)
+            # a FITS file has blocks of 2880 bytes; the zeros take no disk space until pixels are written
+            file.truncate(offsets[name] + -(-n_pixels * 4 // 2880) * 2880)
     return offsets
+
+
+@export_command("meds")
+def command(
+    store: StoreArgument,
+    out: Folder,
+    ids: Annotated[list[int] | None, typer.Option("--id", help="Id of an object; may be repeated.")] = None,
+    cone: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--cone", metavar="RA DEC RADIUS", help="All objects there: degrees, degrees, arcsec."),
+    ] = None,
+    band: Bands = None,
+    size: Annotated[int, typer.Option("--size", help="Pixels a side, even.")] = 48,
+    catalog: Annotated[str, typer.Option("--catalog", help="Whose objects: truth, roman or rubin.")] = "truth",
+) -> None:
+    """Write cutouts of objects from all Roman exposures that see them, with WCS and PSF: a MEDS file for each band."""
+    if (ids is None) == (cone is None):
+        raise UserError("export meds needs --id (one or more) or --cone, not both")
+    wanted = Cone(*cone) if cone is not None else ids or []
+    report_written(export_meds(open_survey(store), out, wanted, band or [], size, catalog))

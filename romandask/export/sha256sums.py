@@ -1,4 +1,4 @@
-"""Checksums of exported files, beside them: SHA256SUMS, which `sha256sum -c` reads, and which has a sum of itself."""
+"""Checksums of exported files: a SHA256SUMS beside the files, which `sha256sum -c` reads, with a checksum of itself."""
 
 from __future__ import annotations
 
@@ -16,29 +16,47 @@ _DAMAGED = "the list itself is damaged"
 
 
 def note(path: Path) -> None:
-    """Add a file to the SHA256SUMS of its folder; those of other files stay.
+    """Add the checksum of a file to the SHA256SUMS of its folder; the entries of other files stay.
+
+    Parameters
+    ----------
+    path : Path
+        Written file.
 
     Raises
     ------
     UserError
-        If it cannot be written, or the one that is there is damaged.
+        If SHA256SUMS cannot be written, or is damaged.
     """
-    listed = path.with_name(NAME)
-    there: dict[str, str] = {}
-    if listed.exists():
-        there, whole = _read(path.parent)
-        if not whole:
-            raise UserError(f"{listed}: {_DAMAGED}: remove it, and export again what the folder holds")
+    sums_path = path.with_name(NAME)
+    sums: dict[str, str] = {}
+    if sums_path.exists():
+        sums, is_intact = _read(path.parent)
+        if not is_intact:
+            raise UserError(f"{sums_path}: {_DAMAGED}: remove it, and export again what the folder holds")
     try:
-        write_bytes(listed, _text(there | {path.name: _sum(path)}).encode())
+        write_bytes(sums_path, _text(sums | {path.name: _sum(path)}).encode())
     except OSError as error:
-        raise UserError(f"{listed}: cannot be written ({error.strerror})") from None
+        raise UserError(f"{sums_path}: cannot be written ({error.strerror})") from None
 
 
 def check(folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield each file of a folder's SHA256SUMS, with what is wrong with it; empty where it is as it was written."""
-    sums, whole = _read(folder)
-    if not whole:
+    """Compare the files of a folder with its SHA256SUMS.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder with a SHA256SUMS.
+
+    Yields
+    ------
+    name : str
+        Name of a file.
+    problem : str
+        What is wrong with the file; empty if it is as it was written.
+    """
+    sums, is_intact = _read(folder)
+    if not is_intact:
         yield NAME, _DAMAGED
     for name, expected in sums.items():
         try:
@@ -50,15 +68,15 @@ def check(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _text(sums: dict[str, str]) -> str:
-    """Return the list of some sums by name, its last line a comment with their number and the sum of the others."""
-    lines = "".join(f"{value}  {name}\n" for name, value in sorted(sums.items()))
+    """Return the text of SHA256SUMS; its last line is a comment: the number of files, the checksum of the list."""
+    lines = "".join(f"{checksum}  {name}\n" for name, checksum in sorted(sums.items()))
     return f"{lines}# {len(sums)} files {hashlib.sha256(lines.encode()).hexdigest()}\n"
 
 
 def _read(folder: Path) -> tuple[dict[str, str], bool]:
-    """Return the sums of a list by name, and whether it is as it was written."""
+    """Return the checksums of a list by name, and whether the list is as it was written."""
     text = (folder / NAME).read_bytes().decode(errors="replace")
-    sums = {name: value for value, name in _LINE.findall(text)}
+    sums = {name: checksum for checksum, name in _LINE.findall(text)}
     return sums, text == _text(sums)
 
 

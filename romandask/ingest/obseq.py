@@ -1,10 +1,11 @@
-"""Roman observing sequences: FITS files with a table of visits (date, exptime, ra, dec, pa, filter) in HDU 1."""
+"""Roman observing sequences: FITS files with a table of visits (date, exptime, ra, dec, pa, filter) in HDU 1.
+
+`romandask.export.obseq` writes them.
+"""
 
 from __future__ import annotations
 
-import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -86,29 +87,3 @@ def read(path: AnyPath) -> pd.DataFrame:
     )
     check_ranges(visits, path, {})
     return visits
-
-
-def write(path: Path, visits: pd.DataFrame) -> None:
-    """Write visits (columns visit, band, mjd, exptime, ra, dec, pa) as an observing sequence; `read` undoes it.
-
-    The table is that of the mission's own file: five columns of doubles and one of text; the row index is the visit.
-    The file appears under its name once it is complete.
-
-    Raises
-    ------
-    UserError
-        If the visits are not numbered 0, 1, 2...
-    """
-    visits = visits.sort_values("visit")
-    if not np.array_equal(visits["visit"], np.arange(len(visits))):
-        raise UserError(f"{path}: column 'visit': expected 0 to {len(visits) - 1} once each, as it is the row's index")
-    bands = visits["band"].astype(str).tolist()
-    names = dict(zip(COLUMNS[:-1], ("mjd", "exptime", "ra", "dec", "pa"), strict=True))
-    columns = [fits.Column(name, "D", array=visits[ours].to_numpy(float)) for name, ours in names.items()]
-    columns.append(fits.Column(COLUMNS[-1], f"{max(4, *map(len, bands), 0)}A", array=bands))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        fits.BinTableHDU.from_columns(columns).writeto(temporary, overwrite=True)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

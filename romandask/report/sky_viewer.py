@@ -17,7 +17,7 @@ import numpy as np
 from astropy.wcs import WCS
 from PIL import Image
 
-from romandask.export.catalogs import prepare
+from romandask.export.files import make_folder
 from romandask.model.errors import UserError
 from romandask.model.sky import from_tangent_plane
 from romandask.model.tiles import tangent_header
@@ -136,7 +136,7 @@ def write_sky_viewer(survey: Survey, folder: Path) -> Path:
     layers = {name: layer for name, layer in layers.items() if layer.numbers}
     if not layers:
         raise UserError("no coadds are stored: romandask run makes them")
-    prepare(folder)
+    make_folder(folder)
     shown = []
     for name, layer in layers.items():
         _pictures(layer, folder / name, max(plane.top, layer.finest), 0, 0)

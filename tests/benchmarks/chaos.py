@@ -27,9 +27,12 @@ from output_hashes import output_hashes
 
 from romandask.engine.event_log import events, runs
 from romandask.export import sha256sums
-from romandask.export.catalogs import export_meds, export_psf, export_truth
-from romandask.export.images import export_fits, export_moc
-from romandask.export.roman_datamodels import export_asdf, export_mosaics
+from romandask.export.asdf import export_asdf
+from romandask.export.fits import export_fits
+from romandask.export.meds import export_meds
+from romandask.export.moc import export_moc
+from romandask.export.psf import export_psf
+from romandask.export.truth import export_truth
 from romandask.model.seeds import rng
 from romandask.model.sky import Cone
 from romandask.run import verify_store
@@ -180,7 +183,7 @@ def damage_exports(store: Path, folder: Path, count: int, random: np.random.Gene
     survey = open_survey(store)
     roman, tile = survey.output("exposures/roman").names[0], survey.tiles[0]
     written = export_fits(survey, folder, "roman", [roman], [tile.name], [])
-    written += export_asdf(survey, folder, [roman]) + export_mosaics(survey, folder, [tile.name], [])
+    written += export_asdf(survey, folder, [roman], [tile.name], [])
     written += export_truth(survey, folder) + export_psf(survey, folder, [roman]) + export_moc(survey, folder)
     written += export_meds(survey, folder, Cone(tile.ra, tile.dec, 8.0), [], 32, "truth")
     for path in written:

@@ -11,12 +11,12 @@ import pytest
 from conftest import command
 from rich.console import Console
 
-from romandask.cli import export as export_commands
 from romandask.cli import main as cli
 from romandask.cli.main import main
 from romandask.engine import progress
 from romandask.engine.event_log import Log, events, newest_event, runs
 from romandask.engine.progress import Pace, Reporter, duration
+from romandask.export import obseq
 from romandask.storage.lock import in_use, locked
 from romandask.survey import Survey
 
@@ -82,7 +82,7 @@ def test_what_takes_long_says_that_it_goes_on(monkeypatch):
 
 @pytest.mark.parametrize(
     ("words", "module", "text"),
-    [(["plan", "tiny"], cli, "planning: "), (["export", "obseq", "tiny", "o.fits"], export_commands, "exporting: ")],
+    [(["plan", "tiny"], cli, "planning: "), (["export", "obseq", "tiny", "o.fits"], obseq, "exporting: ")],
 )
 def test_commands_that_take_long_say_that_they_go_on(words, module, text, monkeypatch, tmp_path, capsys):
     """The survey of each command is held until something has been said: its own speed does not matter."""

@@ -1,4 +1,4 @@
-"""Images at the door: what other tools read from the files is what the store has."""
+"""Exported images: the values that other tools read from the files are those of the store."""
 
 import warnings
 
@@ -15,8 +15,10 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from mocpy import MOC
 
-from romandask.export.images import export_fits, export_moc, export_obscore
-from romandask.export.roman_datamodels import export_asdf, export_mosaics
+from romandask.export.asdf import export_asdf
+from romandask.export.fits import export_fits
+from romandask.export.moc import export_moc
+from romandask.export.obscore import export_obscore
 from romandask.instruments.exposure import exposure_of
 from romandask.model.errors import UserError
 from romandask.stages.pointings import corners_of
@@ -29,8 +31,8 @@ def survey(tiny_store):
         yield open_survey(tiny_store)
 
 
-def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
-    """What astropy reads is what the store has, where the WCS of the store says."""
+def test_fits_images_have_the_stored_pixels_and_valid_checksums(survey, tmp_path):
+    """astropy reads the stored pixels, with the WCS of the store."""
     roman = survey.output("exposures/roman")
     tile = survey.tiles[0].name
     (one,) = export_fits(survey, tmp_path, "roman", [roman.names[1]], [], [])
@@ -44,7 +46,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
             np.testing.assert_array_equal(hdus["DQ"].data, stored["dq"])
             assert hdus["SCI"].header["BUNIT"] == "electron"
             assert hdus["DQ"].header["BIT*"]
-            # of empty pixels ERR is the scatter (their median deviation is a whole number of electrons)
+            # the median absolute deviation of the image is a whole number of electrons, so std is used
             empty = stored["truth"] < 0.5
             scatter = float(hdus["SCI"].data[empty].std(dtype=float))
             assert scatter == pytest.approx(np.median(hdus["ERR"].data[empty]), rel=0.03)
@@ -58,7 +60,7 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
             coadd = survey.coadds("rubin").sel(band="i").isel(tile=0)
             np.testing.assert_array_equal(hdus["SCI"].data, coadd["image"])
             np.testing.assert_array_equal(hdus["WHT"].data, coadd["weight"])
-            # these tiles have inverse variances
+            # the weights of these tiles are inverse variances
             covered = hdus["WHT"].data > 0
             error = hdus["ERR"].data[covered] * np.sqrt(hdus["WHT"].data[covered])
             np.testing.assert_allclose(error, 1, rtol=0.02)
@@ -67,10 +69,10 @@ def test_images_leave_as_fits_with_their_checksums(survey, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
-    """roman_datamodels reads and validates them; their gwcs is the FITS WCS; a star has the flux that it had."""
+def test_exposures_are_valid_level_2_images(survey, tmp_path):
+    """roman_datamodels reads and validates them; the gwcs is the FITS WCS; the calibration gives the flux of a star."""
     product = survey.output("exposures/roman")
-    (path,) = export_asdf(survey, tmp_path, [product.names[1]])
+    (path,) = export_asdf(survey, tmp_path, [product.names[1]], [], [])
     stored, exposure = product.load(1), exposure_of(survey.pointings("roman").iloc[1])
     instrument = survey.instruments["roman"]
     with rdm.open(path) as model:
@@ -99,10 +101,10 @@ def test_exposures_leave_as_level_2_images_that_validate(survey, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
-    """Surface brightness, WCS, exposures by bit, and the metadata of a simulated community product."""
+def test_tiles_are_valid_level_3_mosaics(survey, tmp_path):
+    """Surface brightness, WCS, bits of the exposures, and the metadata of a simulated community product."""
     tile = survey.tiles[0]
-    (path,) = export_mosaics(survey, tmp_path, [tile.name], ["H158"])
+    (path,) = export_asdf(survey, tmp_path, [], [tile.name], ["H158"])
     coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
     product = survey.output("coadds/roman")
     sets = product.load(product.names.index(f"{tile.name}-H158"), ("sets",))["sets"]
@@ -125,7 +127,7 @@ def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
         bits = {name for k, name in enumerate(names) if int(model.context[k // 32, y, x]) >> (k % 32) & 1}
         assert bits == set(sets.loc[sets["set"] == int(coadd["set"][y, x]), "exposure"])
         assert len(bits) == int(coadd["nimages"][y, x])
-        # as many electrons as light of that flux gives in the time of the exposures there
+        # number of electrons of that flux in the exposure time of the pixel
         bright = np.unravel_index(int(coadd["image"].values.argmax()), covered.shape)
         flux, number = float(coadd["image"].values[bright]), int(coadd["nimages"].values[bright])
         seconds = number * float(survey.pointings("roman")["exptime"].iloc[0])
@@ -139,7 +141,7 @@ def test_tiles_leave_as_level_3_mosaics_that_validate(survey, tmp_path):
         assert model.meta.coadd_info.time_first < model.meta.coadd_info.time_last
 
 
-def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
+def test_missing_images_and_unknown_endings_are_refused(survey, tmp_path):
     with pytest.raises(UserError, match="nearest H158"):
         export_fits(survey, tmp_path / "out", "roman", ["H158-999999-1"], [], [])
     with pytest.raises(UserError, match="band 'H160'"):
@@ -149,7 +151,7 @@ def test_what_a_survey_does_not_have_is_not_exported(survey, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
+def test_the_obscore_table_describes_all_images(survey, tmp_path):
     roman, rubin = survey.output("coadds/roman"), survey.output("coadds/rubin")
     exposures = survey.output("exposures/roman")
     count = export_obscore(survey, tmp_path / "images.vot")
@@ -175,7 +177,7 @@ def test_all_images_are_told_in_the_columns_of_archives(survey, tmp_path):
     assert len(pd.read_parquet(tmp_path / "images.parquet")) == count
 
 
-def test_maps_of_areas_hold_what_the_images_hold(survey, tmp_path):
+def test_mocs_cover_the_images_and_their_objects(survey, tmp_path):
     paths = {path.name: path for path in export_moc(survey, tmp_path)}
     roman = MOC.from_fits(paths["coadds-roman-H158.moc.fits"])
     side = survey.pipeline.coadds.grid().side / 3600

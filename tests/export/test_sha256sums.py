@@ -1,4 +1,4 @@
-"""Exported files of every format: whatever is changed, cut or gone is found."""
+"""Checksums of exported files of every format: changed, truncated and missing files are found."""
 
 import subprocess
 
@@ -8,9 +8,13 @@ import pytest
 from conftest import command
 
 from romandask.export import sha256sums
-from romandask.export.catalogs import export_meds, export_psf, export_truth
-from romandask.export.images import export_fits, export_moc, export_obscore
-from romandask.export.roman_datamodels import export_mosaics
+from romandask.export.asdf import export_asdf
+from romandask.export.fits import export_fits
+from romandask.export.meds import export_meds
+from romandask.export.moc import export_moc
+from romandask.export.obscore import export_obscore
+from romandask.export.psf import export_psf
+from romandask.export.truth import export_truth
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
 from romandask.survey import open_survey
@@ -24,7 +28,7 @@ def exported(tiny_store, tmp_path_factory):
         survey = open_survey(tiny_store)
         tile, exposure = survey.tiles[0], survey.output("exposures/roman").names[0]
         written = export_fits(survey, out, "rubin", [], [tile.name], ["i"])
-        written += export_mosaics(survey, out, [tile.name], ["H158"])
+        written += export_asdf(survey, out, [], [tile.name], ["H158"])
         written += export_truth(survey, out)
         written += export_psf(survey, out, [exposure])
         written += export_moc(survey, out)
@@ -41,32 +45,32 @@ def damaged(folder) -> list[str]:
     return [name for name, why in sha256sums.check(folder) if why]
 
 
-def test_every_format_is_there_and_whole(exported):
-    kinds = {path.suffix for path in exported.iterdir()}
-    assert {".fits", ".asdf", ".hdf5", ".vot", ".parquet"} <= kinds
+def test_files_of_every_format_are_listed_and_intact(exported):
+    endings = {path.suffix for path in exported.iterdir()}
+    assert {".fits", ".asdf", ".hdf5", ".vot", ".parquet"} <= endings
     names = sorted(path.name for path in exported.iterdir())
     assert sorted([sha256sums.NAME, *(name for name, _ in sha256sums.check(exported))]) == names
     assert not damaged(exported)
-    # the field's own tool reads the list
+    # the standard tool reads the list
     subprocess.run(["sha256sum", "--quiet", "-c", sha256sums.NAME], cwd=exported, check=True)
 
 
-def test_any_flip_or_cut_is_found(exported):
+def test_every_flipped_bit_and_truncation_is_found(exported):
     random = np.random.default_rng(11)
     files = sorted(exported.iterdir())
     for number in range(6 * len(files)):
         path = files[number % len(files)]
         content = path.read_bytes()
-        place = int(random.integers(len(content)))
+        position = int(random.integers(len(content)))
         changed = bytearray(content)
-        changed[place] ^= 1 << int(random.integers(8))
-        path.write_bytes(changed[:place] if number >= 4 * len(files) else changed)
-        assert path.name in damaged(exported), (path.name, place)
+        changed[position] ^= 1 << int(random.integers(8))
+        path.write_bytes(changed[:position] if number >= 4 * len(files) else changed)
+        assert path.name in damaged(exported), (path.name, position)
         path.write_bytes(content)
     assert not damaged(exported)
 
 
-def test_a_file_that_is_gone_and_a_damaged_list(exported, tmp_path):
+def test_a_missing_file_and_a_damaged_list_are_found(exported, tmp_path):
     path = next(exported.glob("*.vot"))
     content = path.read_bytes()
     path.unlink()
@@ -74,13 +78,13 @@ def test_a_file_that_is_gone_and_a_damaged_list(exported, tmp_path):
     path.write_bytes(content)
     (tmp_path / "one.txt").write_text("1")
     sha256sums.note(tmp_path / "one.txt")
-    listed = (tmp_path / sha256sums.NAME).read_text()
-    (tmp_path / sha256sums.NAME).write_text(listed.split("\n")[-2] + "\n")
+    text = (tmp_path / sha256sums.NAME).read_text()
+    (tmp_path / sha256sums.NAME).write_text(text.split("\n")[-2] + "\n")
     with pytest.raises(UserError, match="list itself is damaged"):
         sha256sums.note(tmp_path / "one.txt")
 
 
-def test_the_command_line_writes_and_reads_them(tiny_store, tmp_path):
+def test_the_command_line_writes_and_verifies_checksums(tiny_store, tmp_path):
     out = tmp_path / "out"
     done = command("export", "obscore", str(tiny_store), str(out / "images.fits"))
     assert done.returncode == 0, done.stderr
@@ -95,7 +99,7 @@ def test_the_command_line_writes_and_reads_them(tiny_store, tmp_path):
     assert command("verify", str(out), "--forget").returncode == 2
 
 
-def test_files_in_the_folder_of_a_store_do_not_stand_for_the_store(tmp_path):
+def test_verify_of_a_store_with_exported_files_verifies_the_store(tmp_path):
     (tmp_path / "one.txt").write_text("1")
     sha256sums.note(tmp_path / "one.txt")
     (tmp_path / "pipeline.yaml").write_text("- not a pipeline\n")

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from romandask.export import meds
+from romandask.export.meds import Catalog, write_meds
 from romandask.kernels.detectors.simple_detector import NO_DATA
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs
@@ -204,14 +204,14 @@ def test_a_meds_file_is_what_galsim_writes(found, objects, tmp_path):
     # image by image, as a survey is read
     limits = np.searchsorted(image, [0, 1, 2, 3])
     parts = [slice(low, high) for low, high in zip(limits[:-1], limits[1:], strict=True)]
-    catalog = meds.Catalog(
+    catalog = Catalog(
         table,
         pd.DataFrame(columns | {"object": number, "image": image}),
         pd.DataFrame({"name": units, "magzp": 31.0}),
         SIZE,
     )
     ours = tmp_path / "ours.fits"
-    meds.write(ours, catalog, ((part, {k: v[part] for k, v in planes.items()}) for part in parts))
+    write_meds(ours, catalog, ((part, {k: v[part] for k, v in planes.items()}) for part in parts))
 
     every = []
     for k in range(len(table)):

@@ -14,6 +14,7 @@ from astropy.utils import iers
 from astropy.wcs import WCS
 from coord.util import sun_position_ecliptic
 
+from romandask.export.obseq import write_obseq
 from romandask.ingest import obseq
 from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.focal_plane import move, separations
@@ -274,7 +275,7 @@ def test_steps_and_times_are_those_of_the_mission(shared, wide):
 def test_a_plan_is_written_as_the_missions_own_file(shared, tmp_path):
     visits = ROMAN.plan(Region(53.0151, 53.0484, -40.0133, -40.0006), 0)
     path = tmp_path / "plan.fits"
-    obseq.write(path, visits)
+    write_obseq(path, visits)
     assert [found.name for found in tmp_path.iterdir()] == ["plan.fits"]
     columns = ["visit", "band", "mjd", "exptime", "ra", "dec", "pa", "seeing", "airmass", "sky_brightness"]
     pd.testing.assert_frame_equal(obseq.read(path), visits[columns])
@@ -283,12 +284,12 @@ def test_a_plan_is_written_as_the_missions_own_file(shared, tmp_path):
         assert ours[1].columns.names == real[1].columns.names
         assert len(ours) == len(real)
     with pytest.raises(UserError, match="column 'visit'"):
-        obseq.write(path, visits.iloc[1:])
+        write_obseq(path, visits.iloc[1:])
 
 
 def test_other_tools_can_point_at_every_visit_of_a_written_plan(tmp_path):
     path = tmp_path / "plan.fits"
-    obseq.write(path, ROMAN.plan(Region(53.0151, 53.0484, -40.0133, -40.0006), 0))
+    write_obseq(path, ROMAN.plan(Region(53.0151, 53.0484, -40.0133, -40.0006), 0))
     with fits.open(path) as hdus:
         table = hdus[1].data
         for i in range(len(table)):

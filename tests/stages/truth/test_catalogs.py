@@ -20,7 +20,7 @@ from rich.console import Console
 from romandask.engine.clients import InProcess
 from romandask.engine.progress import Reporter
 from romandask.engine.task import Batch, Task
-from romandask.export.catalogs import export_truth
+from romandask.export.truth import export_truth
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings

@@ -44,12 +44,6 @@ def noise_realisations(
     ------
     ndarray, shape (rows, columns), float32, electrons
     """
+    generator = partial(rng, seed, "coadds", "noise", instrument.name, exposure.visit, exposure.detector)
     for number in range(count):
-        identity: tuple[int | str, ...] = (
-            "noise",
-            instrument.name,
-            exposure.visit,
-            exposure.detector,
-            *realisation_key(number),
-        )
-        yield noise_realisation(variance, instrument.shape[1], *part, partial(rng, seed, "coadds", *identity))
+        yield noise_realisation(variance, instrument.shape[1], *part, partial(generator, *realisation_key(number)))

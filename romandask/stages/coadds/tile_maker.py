@@ -14,7 +14,7 @@ from romandask.model.settings import CoaddSettings, RenderSettings
 from romandask.model.tiles import Tile
 from romandask.products.image_set import ImageSet
 from romandask.stages.exposures.exposures import Exposures
-from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 
 
 @dataclass(frozen=True)

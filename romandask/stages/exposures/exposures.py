@@ -27,7 +27,8 @@ from romandask.products.units import LazyUnits, Unit
 from romandask.stages.exposures.render import RenderExposure, cone, stage_of
 from romandask.stages.pointings import corners_of
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
-from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
+from romandask.stages.truth.catalogs import truth_of
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.arrays import Variable
 from romandask.storage.store import Store
 

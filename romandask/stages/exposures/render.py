@@ -21,7 +21,7 @@ from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
 from romandask.products.tables import to_frame
 from romandask.stages.pointings import corners_of
-from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.manifest import read_record
 from romandask.storage.store import Store, read_parquet
 

@@ -1,14 +1,14 @@
-"""Calibration: the planes that exposures with the full model of a detector read."""
+"""Calibration planes of the detectors, which the full detector model of exposures reads."""
 
 from __future__ import annotations
 
 from romandask.model.errors import UserError
 from romandask.products.images import ImageProduct
-from romandask.stages.stage import Stage, SurveyContext
+from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 
 
 def build_calibration(context: SurveyContext, survey: str) -> ImageProduct:
-    """Return the lazy calibrations of the detectors that an instrument's pointings use.
+    """Return the lazy calibrations of the detectors that occur in the pointings of an instrument.
 
     Raises
     ------
@@ -27,7 +27,7 @@ CALIBRATION = Stage(
     per_survey=True,
     build=build_calibration,
     exists=lambda context, survey: context.instruments[survey].calibrated,
-    units_known_after=("pointings", "truth/ingested"),
+    units_known_after=UNITS_FROM_POINTINGS,
     unit="detector",
-    summary="With the full detector model: the planes that exposures read, from calibration files or made up.",
+    summary="Calibration planes of the full detector model, from calibration files or generated.",
 )

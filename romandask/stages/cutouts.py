@@ -1,10 +1,10 @@
-"""Cutouts: small squares around objects from every image that sees them, with local WCS and PSF, lazily."""
+"""Lazy cutouts of objects from all images that contain them, with the local WCS and PSF."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import dask
 import dask.array as da
@@ -22,89 +22,125 @@ from romandask.products.tables import TableProduct
 from romandask.storage.manifest import digest
 
 LARGEST_CUTOUT_PIXELS = 256
-"""Pixels a side of the largest cutouts."""
-_EDGE = 1.0
-"""Arcsec by which footprints, whose edges are arcs, are grown before the WCS decides what lies inside."""
-
-
+"""Largest side of a cutout, pixels."""
+_FOOTPRINT_MARGIN = 1.0
+"""Margin, arcsec, of the search by footprints, whose edges are great circles; the WCS then decides what is inside."""
 Wanted = Sequence[int] | np.ndarray | pd.DataFrame | Region | Cone
-"""Objects: their ids, a table with columns id, ra, dec (degrees), or a part of the sky."""
+"""Selection of objects: their ids, a table with the columns id, ra and dec (degrees), or an area on the sky."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Type and description of one layer of cutouts."""
+
+    dtype: str
+    attributes: dict[str, Any]
+    """Attributes of the xarray variable: units, long_name, ..."""
 
 
 @dataclass(frozen=True)
 class Positions:
-    """A table of objects, with the names of the columns that cutouts need."""
+    """A table of objects, and the names of its columns with ids and positions."""
 
     product: TableProduct
+    """The table."""
     id: str
+    """Column of the id."""
     ra: str
-    """degrees"""
+    """Column of the right ascension, degrees."""
     dec: str
-    """degrees"""
+    """Column of the declination, degrees."""
 
     def named(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """Return id, ra and dec under these names."""
+        """Return the three columns of rows of the table, renamed to id, ra and dec."""
         return rows[[self.id, self.ra, self.dec]].set_axis(["id", "ra", "dec"], axis=1)
 
 
 class Images(Protocol):
-    """Images of exposures or coadds, and what cutouts need to know of them."""
+    """The images of exposures or coadds that cutouts are made from. `Exposures` and `Coadds` implement it."""
 
     product: ImageProduct
+    """The lazy images; one image per unit."""
 
     @property
     def footprints(self) -> np.ndarray:
-        """(n, 4, 2) corners of the images, degrees."""
+        """Corners of the images, shape (n, 4, 2), degrees."""
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """(ny, nx) of an image."""
+        """Rows and columns of an image."""
 
     @property
     def unit_bands(self) -> np.ndarray:
-        """(n,) band of each image."""
+        """Band of each image, shape (n,)."""
 
     @property
     def extra_layers(self) -> dict[str, tuple[str, str, str]]:
-        """Layers beside the stored arrays: dtype, unit, description."""
+        """Dtype, unit and description of the layers that are not stored, by name."""
 
-    def header(self, index: int) -> dict:
-        """Return the FITS header of the WCS of an image."""
+    def header(self, index: int) -> dict[str, Any]:
+        """Return the FITS header with the WCS of an image."""
 
     def make_layers(
         self, index: int, wanted: Sequence[str], window: tuple[slice, slice], arrays: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Return the layers of a window of an image that are not stored, but for `psf`."""
+        """Return the requested layers of a window of an image that are not stored, except `psf`.
+
+        Parameters
+        ----------
+        index : int
+            Index of the image.
+        wanted : sequence of str
+            Names of the requested layers.
+        window : (slice, slice)
+            Rows and columns of the window.
+        arrays : dict of str to ndarray
+            Stored arrays of the window, from which the layers may be computed.
+        """
 
     def make_psfs(self, index: int, positions: np.ndarray, size: int) -> np.ndarray:
-        """Return the PSF (n, size, size) at positions (n, 2), pixels, of an image."""
+        """Return the PSFs, shape (n, size, size), at positions (x, y) on an image, shape (n, 2), pixels."""
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where objects are on images: one row a cutout, by image, then by object."""
+@dataclass(frozen=True, kw_only=True)
+class CutoutPositions:
+    """Positions of n cutouts on images, sorted by image, then by object."""
 
-    frame: np.ndarray
-    """(n,) which of the frames."""
+    image: np.ndarray
+    """Index of the image, shape (n,)."""
     row: np.ndarray
-    """(n,) row of the table of objects."""
+    """Row in the table of objects, shape (n,)."""
     x: np.ndarray
-    """(n,) pixel coordinate on the image, 0 at the centre of the first pixel."""
+    """Position of the object on the image along x, 0 at the centre of the first pixel, shape (n,), pixels."""
     y: np.ndarray
-    """(n,)"""
+    """Position of the object along y, as `x`."""
     corner: np.ndarray
-    """(n, 2) column and row of the cutout's first pixel on the image; it may lie off it."""
+    """Column and row on the image of the first pixel of the cutout, shape (n, 2); it may lie outside the image."""
     jacobian: np.ndarray
-    """(n, 2, 2) arcsec a pixel: (west, north) by (x, y), GalSim's frame."""
+    """Derivative of (west, north), GalSim's frame, with respect to (x, y), shape (n, 2, 2), arcsec/pixel."""
 
 
 def located(of: Wanted, tables: Sequence[Positions], catalog: str) -> pd.DataFrame:
-    """Return id, ra and dec of objects: in the order of their ids, or in that of the tables.
+    """Return id, ra and dec of selected objects.
+
+    Parameters
+    ----------
+    of : Wanted
+        Selection of objects.
+    tables : sequence of Positions
+        Tables in which ids and areas on the sky are looked up.
+    catalog : str
+        Name of the tables in error messages.
+
+    Returns
+    -------
+    DataFrame
+        One row per object, in the order of the ids (without repetitions), or in the order of the tables.
 
     Raises
     ------
     UserError
-        If an id is in none of the tables; `catalog` is what they are called.
+        If an id is in none of the tables, ids are not integers, or a column of a given table is missing.
     """
     if isinstance(of, pd.DataFrame):
         missing = sorted({"id", "ra", "dec"} - set(of.columns))
@@ -135,148 +171,187 @@ def cutouts(
     bands: tuple[str, ...] | None = None,
     size: int = 48,
 ) -> xr.Dataset:
-    """Return lazy cutouts (cutout, y, x) of the images of a product whose pixels hold the centres of objects.
+    """Return lazy cutouts, with the dims (cutout, y, x), of the images that contain the centres of objects.
 
-    Cutouts are in the order of the images, then of the objects, a chunk an image: each image is read, or made, once.
-    Pixels beyond an image's edge are 0 in every layer, and flagged `no_data` in `dq`.
+    Cutouts are sorted by image, then by object. Each image is one chunk, so it is read, or made, once. Pixels outside
+    an image are 0 in every layer, and flagged `no_data` in `dq`.
 
     Parameters
     ----------
     images : Exposures or Coadds
-    objects : columns id, ra, dec (degrees)
-    layers : of the product's own, and for exposures also `background`, `weight`, `psf`
-    bands : those of the images; None for all
-    size : pixels a side, even, at most 256
+        Images to cut from.
+    objects : DataFrame
+        Objects, with the columns id, ra and dec (degrees).
+    layers : tuple of str
+        Names of arrays of the product; for exposures also `background`, `weight` and `psf`.
+    bands : tuple of str, optional
+        Bands of the images to cut from; all by default.
+    size : int, pixels
+        Side of a cutout, even, at most 256.
 
     Raises
     ------
     UserError
-        If a layer, a band or the size is not possible.
+        If there is no such layer or band, or the size is not allowed.
     """
     product, unit_bands = images.product, images.unit_bands
-    known = sorted(set(unit_bands.tolist()))
+    known_bands = sorted(set(unit_bands.tolist()))
     for band in bands or ():
-        if band not in known:
-            raise UserError(f"band {band!r}: the images have {', '.join(known)}")
+        if band not in known_bands:
+            raise UserError(f"band {band!r}: the images have {', '.join(known_bands)}")
     if not 8 <= size <= LARGEST_CUTOUT_PIXELS or size % 2:
         raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST_CUTOUT_PIXELS}")
-    chosen = np.flatnonzero(np.isin(unit_bands, bands or known))
-    planes = {v.name: (v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
-    planes |= {name: (kind, {"units": u, "long_name": t}) for name, (kind, u, t) in images.extra_layers.items()}
-    for layer in layers:
-        if layer not in planes:
-            raise UserError(f"layer {layer!r}: {product.stage} has {', '.join(planes)}")
-    return _dataset(images, find(images, chosen, objects, size), objects, {n: planes[n] for n in layers}, size)
+    chosen = np.flatnonzero(np.isin(unit_bands, bands or known_bands))
+    known = {v.name: Layer(v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
+    known |= {
+        name: Layer(dtype, {"units": unit, "long_name": text})
+        for name, (dtype, unit, text) in images.extra_layers.items()
+    }
+    for name in layers:
+        if name not in known:
+            raise UserError(f"layer {name!r}: {product.stage} has {', '.join(known)}")
+    positions = find_cutouts(images, chosen, objects, size)
+    return _dataset(images, positions, objects, {name: known[name] for name in layers}, size)
 
 
-def find(images: Images, chosen: np.ndarray, objects: pd.DataFrame, size: int) -> Places:
-    """Return where objects are on the chosen frames that see their centres."""
+def find_cutouts(images: Images, chosen: np.ndarray, objects: pd.DataFrame, size: int) -> CutoutPositions:
+    """Return the positions of the cutouts of objects on the chosen images that contain their centres.
+
+    Parameters
+    ----------
+    images : Images
+        Images to cut from.
+    chosen : ndarray of int
+        Indices of the chosen images.
+    objects : DataFrame
+        Objects, with the columns id, ra and dec (degrees).
+    size : int, pixels
+        Side of a cutout.
+    """
     ra, dec = objects["ra"].to_numpy(float), objects["dec"].to_numpy(float)
     ny, nx = images.image_shape
-    which, point = covering_pairs(images.footprints[chosen], ra, dec, _EDGE)
+    which, point = covering_pairs(images.footprints[chosen], ra, dec, _FOOTPRINT_MARGIN)
     numbers, starts = np.unique(which, return_index=True)
-    found: list[tuple[np.ndarray, ...]] = []
+    parts = []
     for number, rows in zip(numbers, np.split(point, starts)[1:], strict=True):
         header = images.header(int(chosen[number]))
         x, y, to_pixels = pixel_positions(WCS(header), ra[rows], dec[rows])
         inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
         rows, x, y, to_pixels = rows[inside], x[inside], y[inside], to_pixels[inside]
-        # the object lies within half a pixel of the cutout's middle
-        corner = np.rint(np.stack([x, y], -1) - (size - 1) / 2).astype(int)
-        found.append((np.full(len(rows), chosen[number]), rows, x, y, corner, np.linalg.inv(to_pixels)))
-    if not found:
+        parts.append(
+            {
+                "image": np.full(len(rows), chosen[number]),
+                "row": rows,
+                "x": x,
+                "y": y,
+                # the object lies within half a pixel of the centre of the cutout
+                "corner": np.rint(np.stack([x, y], -1) - (size - 1) / 2).astype(int),
+                "jacobian": np.linalg.inv(to_pixels),
+            }
+        )
+    if not parts:
         none = np.empty(0)
-        return Places(none.astype(int), none.astype(int), none, none, np.empty((0, 2), int), np.empty((0, 2, 2)))
-    return Places(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        return CutoutPositions(
+            image=none.astype(int),
+            row=none.astype(int),
+            x=none,
+            y=none,
+            corner=np.empty((0, 2), int),
+            jacobian=np.empty((0, 2, 2)),
+        )
+    return CutoutPositions(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def _dataset(
-    images: Images, places: Places, objects: pd.DataFrame, layers: dict[str, tuple[str, dict]], size: int
+    images: Images, positions: CutoutPositions, objects: pd.DataFrame, layers: dict[str, Layer], size: int
 ) -> xr.Dataset:
-    """Return the lazy arrays with the coordinates of every cutout."""
+    """Return the lazy layers, with the coordinates of every cutout."""
     product, axes = images.product, ("cutout",)
-    used, counts = np.unique(places.frame, return_counts=True)
+    used, counts = np.unique(positions.image, return_counts=True)
     data = {}
     if len(used):
         settings = [product.units[unit].settings for unit in used.tolist()]
-        token = digest(product.stage, places.frame, places.x, places.y, size, sorted(layers), settings)
-        name = f"{product.stage.replace('/', '-')}-cutouts-{token}"
-        source = dask.delayed(Cut(images, used, _per_frame(places, used), tuple(layers), size), name=name)
+        token = digest(product.stage, positions.image, positions.x, positions.y, size, sorted(layers), settings)
+        task = f"{product.stage.replace('/', '-')}-cutouts-{token}"
+        cut = CutImage(images, used, _per_image(positions, used), tuple(layers), size)
+        source = dask.delayed(cut, name=task)
         bundles = da.map_blocks(
-            _cut_block, source, chunks=((1,) * len(used),), dtype=object, meta=np.empty(0, object), name=f"{name}-unit"
+            _cut_block, source, chunks=((1,) * len(used),), dtype=object, meta=np.empty(0, object), name=f"{task}-unit"
         )
-    for layer, (dtype, attributes) in layers.items():
-        array = da.zeros((0, size, size), dtype)
+    for name, layer in layers.items():
+        array = da.zeros((0, size, size), layer.dtype)
         if len(used):
             array = da.map_blocks(
                 _layer_of,
                 bundles,
-                layer,
+                name,
                 chunks=(tuple(counts.tolist()), (size,), (size,)),
                 new_axis=[1, 2],
-                dtype=dtype,
-                meta=np.empty((0, 0, 0), dtype),
-                name=f"{name}-{layer}",
+                dtype=layer.dtype,
+                meta=np.empty((0, 0, 0), layer.dtype),
+                name=f"{task}-{name}",
             )
-        axis_names = ("v", "u") if layer == "psf" else ("y", "x")
-        data[layer] = ((*axes, *axis_names), array, attributes)
-    unit_names = np.array(product.names, object)[places.frame]
+        axis_names = ("v", "u") if name == "psf" else ("y", "x")
+        data[name] = ((*axes, *axis_names), array, layer.attributes)
+    unit_names = np.array(product.names, object)[positions.image]
     degrees = {"units": "deg"}
-    pixel = {"units": "pixel", "description": "on the whole image, 0 at the centre of the first pixel"}
-    first = {"units": "pixel", "description": "of the cutout's first pixel on the whole image"}
-    text = {"units": "arcsec/pixel", "description": "(west, north) by (x, y)"}
+    on_image = {"units": "pixel", "description": "on the whole image, 0 at the centre of the first pixel"}
+    first_pixel = {"units": "pixel", "description": "of the first pixel of the cutout, on the whole image"}
+    derivative = {"units": "arcsec/pixel", "description": "derivative of (west, north) with respect to (x, y)"}
     coordinates = {
-        "id": (axes, objects["id"].to_numpy()[places.row], {}),
-        "object": (axes, places.row, {"description": "row among the objects that were asked for"}),
-        "ra": (axes, objects["ra"].to_numpy(float)[places.row], degrees),
-        "dec": (axes, objects["dec"].to_numpy(float)[places.row], degrees),
+        "id": (axes, objects["id"].to_numpy()[positions.row], {}),
+        "object": (axes, positions.row, {"description": "row in the table of the selected objects"}),
+        "ra": (axes, objects["ra"].to_numpy(float)[positions.row], degrees),
+        "dec": (axes, objects["dec"].to_numpy(float)[positions.row], degrees),
         "unit": (axes, unit_names.astype(str), {"description": "image: exposure, or tile and band"}),
-        "band": (axes, images.unit_bands[places.frame].astype(str), {}),
-        "x_image": (axes, places.x, pixel),
-        "y_image": (axes, places.y, pixel),
-        "column": (axes, places.corner[:, 0], first),
-        "row": (axes, places.corner[:, 1], first),
-        "jacobian": ((*axes, "sky", "pixel"), places.jacobian, text),
+        "band": (axes, images.unit_bands[positions.image].astype(str), {}),
+        "x_image": (axes, positions.x, on_image),
+        "y_image": (axes, positions.y, on_image),
+        "column": (axes, positions.corner[:, 0], first_pixel),
+        "row": (axes, positions.corner[:, 1], first_pixel),
+        "jacobian": ((*axes, "sky", "pixel"), positions.jacobian, derivative),
     }
     return xr.Dataset(data, coordinates, {"survey": product.attributes.get("survey", ""), "size": size})
 
 
-def _per_frame(places: Places, used: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return positions (n, 2) and corners (n, 2) of the cutouts of each frame."""
-    limits = np.searchsorted(places.frame, [*used, used[-1] + 1])
-    at = np.stack([places.x, places.y], -1)
-    return tuple((at[low:high], places.corner[low:high]) for low, high in zip(limits[:-1], limits[1:], strict=True))
+def _per_image(positions: CutoutPositions, used: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return the positions of the objects and the corners of the cutouts, each (n, 2), on each used image."""
+    limits = np.searchsorted(positions.image, [*used, used[-1] + 1])
+    xy = np.stack([positions.x, positions.y], -1)
+    return tuple((xy[low:high], positions.corner[low:high]) for low, high in zip(limits[:-1], limits[1:], strict=True))
 
 
 @dataclass(frozen=True)
-class Cut:
-    """Cuts the squares of one image."""
+class CutImage:
+    """Makes the cutouts of one image."""
 
     images: Images
     units: np.ndarray
-    """(images,) number of each in the product."""
-    places: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """By image: positions (n, 2) and corners (n, 2)."""
+    """Index in the product of each image that has cutouts, shape (images,)."""
+    positions: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """Positions of the objects and corners of the cutouts on each of these images, each (n, 2), pixels."""
     layers: tuple[str, ...]
+    """Names of the layers."""
     size: int
+    """Side of a cutout, pixels."""
 
     def __call__(self, number: int) -> dict[str, np.ndarray]:
-        """Return the layers (n, size, size) of an image."""
-        unit, (at, corners) = int(self.units[number]), self.places[number]
+        """Return the layers, each (n, size, size), of the cutouts of one of the images that have cutouts."""
+        unit, (xy, corners) = int(self.units[number]), self.positions[number]
         product = self.images.product
-        own = {v.name: v.shape[-2:] for v in product.variables if v.axes[-2:] == ("y", "x")}
-        shape = next(iter(own.values()))
+        stored_layers = {v.name: v.shape[-2:] for v in product.variables if v.axes[-2:] == ("y", "x")}
+        shape = next(iter(stored_layers.values()))
         low = np.clip(corners.min(axis=0), 0, np.array(shape[::-1]))
         high = np.clip(corners.max(axis=0) + self.size, 0, np.array(shape[::-1]))
         window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
-        wanted = {name for name in self.layers if name in own}
+        wanted = {name for name in self.layers if name in stored_layers}
         if "weight" in self.layers:
             wanted |= {"dq", "image", "variance"}
-        arrays = product.load(unit, tuple(sorted(wanted & set(own))), window) if wanted else {}
-        # of planes that there are several of, noise realisations, the first
+        arrays = product.load(unit, tuple(sorted(wanted & set(stored_layers))), window) if wanted else {}
+        # of several noise realisations, the first
         arrays = {name: plane if plane.ndim == 2 else plane[0] for name, plane in arrays.items()}
         arrays |= self.images.make_layers(unit, self.layers, window, arrays)
-        made = {"psf": self.images.make_psfs(unit, at, self.size)} if "psf" in self.layers else {}
+        made = {"psf": self.images.make_psfs(unit, xy, self.size)} if "psf" in self.layers else {}
         for name in self.layers:
             if name != "psf":
                 outside = NO_DATA if name == "dq" else 0
@@ -285,10 +360,21 @@ class Cut:
 
 
 def squares(image: np.ndarray, corners: np.ndarray, size: int, outside: float) -> np.ndarray:
-    """Return squares (n, size, size) of an image that begin at `corners` (n, 2), column and row.
+    """Return square cutouts of an image, shape (n, size, size).
 
-    Pixels off the image are `outside`:
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Image.
+    corners : ndarray of int, shape (n, 2)
+        Column and row of the first pixel of each cutout; they may lie outside the image.
+    size : int, pixels
+        Side of a cutout.
+    outside : float
+        Value of pixels outside the image.
 
+    Examples
+    --------
     >>> squares(np.arange(4).reshape(2, 2), np.array([[-1, 0]]), 2, 9)
     array([[[9, 0],
             [9, 2]]])
@@ -303,7 +389,7 @@ def squares(image: np.ndarray, corners: np.ndarray, size: int, outside: float) -
     return out
 
 
-def _cut_block(cut: Cut, block_id: tuple[int, ...] = ()) -> np.ndarray:
+def _cut_block(cut: CutImage, block_id: tuple[int, ...] = ()) -> np.ndarray:
     bundle = np.empty(1, object)
     bundle[0] = cut(block_id[0])
     return bundle

@@ -1,10 +1,10 @@
-"""Pointings: one row an exposure (visit x detector) that touches the survey's tiles, with its footprint."""
+"""Pointings table of an instrument: the exposures (visit and detector) that touch a tile, with their footprints."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -22,33 +22,71 @@ from romandask.stages.stage import Stage, SurveyContext
 from romandask.storage.paths import AnyPath, access_errors_explained, file_state, resolve_below
 
 READERS: dict[str, Callable[[AnyPath], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
+"""Reader of each format of observing sequences, by the setting `source`."""
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
+"""Columns with the corners of the footprint, degrees, in order along its outline."""
+
+
+class PointingsSettings(Protocol):
+    """The `pointings` section of an instrument's settings, as far as all instruments share it."""
+
+    @property
+    def source(self) -> str:
+        """Format of the observing sequence, a key of `READERS`; any other value selects the instrument's own plan."""
+
+    @property
+    def path(self) -> str | None:
+        """Path of the observing sequence, relative to the data folder."""
 
 
 def pointings(
-    instrument: Instrument, settings, data: AnyPath, region: Region, tiles: list[Tile], side: float, seed: int
+    instrument: Instrument,
+    settings: PointingsSettings,
+    data: AnyPath,
+    region: Region,
+    tiles: list[Tile],
+    side: float,
+    seed: int,
 ) -> pd.DataFrame:
-    """Return the exposures whose footprints touch a tile, by visit and detector (schema: catalogs/pointings.yaml).
+    """Return the exposures whose footprints touch a tile, sorted by visit and detector.
 
     Parameters
     ----------
-    settings : the instrument's `pointings` section; its path lies below `data`
-    side : arcsec, of the padded tiles
+    instrument : Instrument
+        Instrument of the exposures.
+    settings : PointingsSettings
+        The `pointings` section of the instrument's settings.
+    data : path
+        Folder that `settings.path` is relative to.
+    region : Region
+        Region that a generated plan covers.
+    tiles : list of Tile
+        Tiles of the survey.
+    side : float, arcsec
+        Side of the padded tiles.
+    seed : int
+        Seed of the survey.
+
+    Returns
+    -------
+    DataFrame
+        One row per exposure (schema: catalogs/pointings.yaml).
 
     Raises
     ------
     UserError
-        If the file cannot be read, or no exposure touches the region in one of the bands.
+        If the file cannot be read, the telescope cannot point to one of the visits near the tiles, or no exposure in
+        one of the bands touches a tile.
     """
-    every = visits(instrument, settings, data, region, seed)
+    planned = visits(instrument, settings, data, region, seed)
     origin = (
         f"{instrument.name}.pointings ({settings.source})"
         if settings.path is None
         else str(resolve_below(data, settings.path))
     )
-    every = every[every["band"].isin(instrument.bands)]
+    planned = planned[planned["band"].isin(instrument.bands)]
     corners = np.stack([tile.corners(side) for tile in tiles])
-    near = every[_near(every, corners, instrument.field_radius)]
+    near = planned[_near(planned, corners, instrument.field_radius)]
     if (refused := instrument.refused(near)).any():
         first = near[refused].iloc[0]
         raise UserError(
@@ -67,33 +105,56 @@ def pointings(
     return rows
 
 
-def visits(instrument: Instrument, settings, data: AnyPath, region: Region, seed: int) -> pd.DataFrame:
-    """Return all visits of the observing sequence, whether or not they touch the region."""
+def visits(
+    instrument: Instrument, settings: PointingsSettings, data: AnyPath, region: Region, seed: int
+) -> pd.DataFrame:
+    """Return all visits of the observing sequence, including those that do not touch the region.
+
+    Parameters are as in `pointings`.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, or the settings lack its path.
+    """
     if settings.source not in READERS:
         return instrument.plan(region, seed)
     if not settings.path:
         raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
-    place = resolve_below(data, settings.path)
-    with access_errors_explained(place):
-        return READERS[settings.source](place)
+    file = resolve_below(data, settings.path)
+    with access_errors_explained(file):
+        return READERS[settings.source](file)
 
 
 def corners_of(table: pd.DataFrame) -> np.ndarray:
-    """Return the footprints (n, 4, 2), degrees, of a pointings table."""
+    """Return the corners of the footprints in a pointings table, shape (n, 4, 2), degrees."""
     return table[list(CORNERS)].to_numpy(float).reshape(-1, 4, 2)
 
 
 def _near(visits: pd.DataFrame, corners: np.ndarray, radius: float) -> np.ndarray:
-    """True where a visit's field may reach a tile."""
-    vectors = unit_vectors(visits["ra"], visits["dec"])
-    tiles = unit_vectors(corners[..., 0], corners[..., 1]).reshape(-1, 3)
-    centre = tiles.mean(axis=0)
-    spread = np.linalg.norm(tiles - centre, axis=1).max()
-    return np.linalg.norm(vectors - centre, axis=1) < spread + chord(radius * 3600)
+    """Return a mask of the visits whose field of view may reach a tile.
+
+    Parameters
+    ----------
+    visits : DataFrame
+        Visits with the columns ra and dec, degrees.
+    corners : ndarray, shape (tiles, 4, 2), degrees
+        Corners of the tiles.
+    radius : float, degrees
+        Radius of the field of view.
+    """
+    boresights = unit_vectors(visits["ra"], visits["dec"])
+    corner_vectors = unit_vectors(corners[..., 0], corners[..., 1]).reshape(-1, 3)
+    centre = corner_vectors.mean(axis=0)
+    spread = np.linalg.norm(corner_vectors - centre, axis=1).max()
+    return np.linalg.norm(boresights - centre, axis=1) < spread + chord(radius * 3600)
 
 
 def _exposures(instrument: Instrument, visits: pd.DataFrame, tiles: np.ndarray) -> pd.DataFrame:
-    """Return a row for each detector of the visits that touches a tile (tiles, 4, 2), by visit and detector."""
+    """Return one row per detector of the visits that touches a tile, sorted by visit and detector.
+
+    `tiles` holds the corners of the tiles, shape (tiles, 4, 2), degrees.
+    """
     footprints = instrument.footprints(visits).reshape(-1, 4, 2)
     touching = np.unique(touching_pairs(footprints, tiles)[0])
     visit, detector = np.divmod(touching, len(instrument.detectors))
@@ -108,22 +169,24 @@ class MakePointings:
     """Makes the pointings table of one instrument."""
 
     instrument: Instrument
-    settings: Any
-    """The `pointings` section of its block in the pipeline."""
+    settings: PointingsSettings
+    """The `pointings` section of the instrument's settings."""
     data: AnyPath
+    """Folder that the paths of source files are relative to."""
     region: Region
     tiles: tuple[Tile, ...]
     side: float
-    """Of the padded tiles, arcsec."""
+    """Side of the padded tiles, arcsec."""
     seed: int
+    """Seed of the survey."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the rows of the one unit."""
+        """Return the rows of the only unit."""
         return pointings(self.instrument, self.settings, self.data, self.region, list(self.tiles), self.side, self.seed)
 
 
 def build_pointings(context: SurveyContext, survey: str) -> TableProduct:
-    """Return the lazy pointings of an instrument: one unit."""
+    """Return the lazy pointings table of an instrument, which has a single unit."""
     pipeline = context.pipeline
     block = pipeline.block(survey)
     settings = {
@@ -144,7 +207,7 @@ def build_pointings(context: SurveyContext, survey: str) -> TableProduct:
     )
     return TableProduct(
         stage=f"pointings/{survey}",
-        units=(Unit("all", settings),),
+        units=(Unit(name="all", settings=settings),),
         make=maker,
         schema=schema("pointings"),
         bytes_per_unit=1 << 30,
@@ -152,7 +215,7 @@ def build_pointings(context: SurveyContext, survey: str) -> TableProduct:
 
 
 def _source_state(data: AnyPath, path: str | None) -> Any:
-    """Return what identifies the content of a source file without reading it."""
+    """Return the path, size and modification time of a source file, which identify its content without reading it."""
     if path is None:
         return None
     file = resolve_below(data, path)
@@ -164,7 +227,7 @@ POINTINGS = Stage(
     per_survey=True,
     build=build_pointings,
     unit="instrument",
-    summary="Exposures (visit and detector) that touch the tiles: a generated plan or cadence, an observing sequence "
+    summary="Exposures (visit and detector) that touch a tile, from a generated plan or cadence, an observing sequence "
     "(FITS) or an OpSim database.",
     tables={"pointings": "pointings/<survey>.parquet"},
 )

@@ -1,4 +1,4 @@
-"""PSF images: for each exposure a unit star, sampled eight times finer than its pixels, pixel response included."""
+"""Oversampled PSF images of exposures: stars of unit flux, with the pixel response."""
 
 from __future__ import annotations
 
@@ -17,28 +17,30 @@ from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 from romandask.storage.arrays import Variable
 
 OVERSAMPLING = 8
-"""Samples along a pixel."""
+"""Samples per native pixel, along each axis."""
 PSF_IMAGE_PIXELS = 64
-"""Native pixels that an image covers."""
+"""Side of a PSF image, native pixels."""
 
 
 def psfs(exposures: Exposures) -> ImageProduct:
-    """Return the lazy PSF images of a survey's exposures: dims (exposure, v, u), coordinates those of the exposures.
+    """Return the lazy PSF images of the exposures of an instrument, with the dims (exposure, v, u).
 
-    Each is the PSF in the middle of the detector of a star of flat f_nu (Troxel et al. 2023, section 5.2), 8 samples a
-    pixel, its centre on sample 256 of both axes. A sample is the share of the star's light in a native pixel
-    centred there: every eighth sample sums to one but for the light beyond the edge.
+    An image shows a star of flat f_nu at the centre of the detector (Troxel et al. 2023, section 5.2), with 8 samples
+    per native pixel; the star is centred on sample 256 of both axes. A sample is the share of the light in a native
+    pixel that is centred on the sample: samples that are one native pixel apart sum to 1, apart from the light beyond
+    the edge of the image. The coordinates are those of the exposures.
     """
-    renderer, images, every = exposures.renderer, exposures.product, exposures.units
+    renderer, images = exposures.renderer, exposures.product
     instrument = renderer.instrument
     side = PSF_IMAGE_PIXELS * OVERSAMPLING
 
     def unit(row: int) -> Unit:
         return Unit(
-            exposures.names[row], {**every[row].settings, "oversampling": OVERSAMPLING, "side": PSF_IMAGE_PIXELS}
+            name=exposures.names[row],
+            settings={**exposures.units[row].settings, "oversampling": OVERSAMPLING, "side": PSF_IMAGE_PIXELS},
         )
 
-    text = {
+    attributes = {
         "units": "1/pixel",
         "long_name": "unit star, flat f_nu, share of light in a native pixel centred on a sample",
         "oversampling": OVERSAMPLING,
@@ -48,7 +50,7 @@ def psfs(exposures: Exposures) -> ImageProduct:
         stage=f"psfs/{instrument.name}",
         units=LazyUnits(exposures.names, unit),
         make=MakePsf(renderer),
-        variables=(Variable("psf", "float32", (side, side), ("v", "u"), text),),
+        variables=(Variable(name="psf", dtype="float32", shape=(side, side), axes=("v", "u"), attributes=attributes),),
         axes=images.axes,
         lengths=images.lengths,
         coordinates=images.coordinates,
@@ -63,9 +65,10 @@ class MakePsf:
     """Makes the PSF image of one exposure."""
 
     render: RenderExposure
+    """Holds the pointings table and the instrument."""
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return the image of the exposure at a row of the pointings table."""
+        """Return the PSF image of the exposure in a row of the pointings table, by name."""
         exposure, instrument = exposure_of(self.render.table.iloc[index]), self.render.instrument
         ny, nx = instrument.shape
         return {"psf": psf_image(instrument, exposure, (nx - 1) / 2, (ny - 1) / 2)}
@@ -74,11 +77,24 @@ class MakePsf:
 def psf_image(
     instrument: Instrument, exposure: Exposure, x: float, y: float, shares: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the PSF image (side, side) at a place, pixels.
+    """Return the oversampled image of a star of unit flux at a position on the detector.
 
     Parameters
     ----------
-    shares : (nodes,) photons of the star's spectrum by node of the band; those of flat f_nu where none are given
+    instrument : Instrument
+        Instrument of the exposure.
+    exposure : Exposure
+        Exposure whose PSF is sampled.
+    x, y : float, pixels
+        Position on the detector.
+    shares : ndarray, shape (nodes,), optional
+        Photons of the star's spectrum at each PSF node of the band, in any unit; by default those of a star of flat
+        f_nu.
+
+    Returns
+    -------
+    ndarray, shape (n, n), with n = PSF_IMAGE_PIXELS * OVERSAMPLING
+        Image as described in `psfs`.
     """
     bandpass = instrument.bandpass(exposure.band)
     shares = flat_shares(bandpass) if shares is None else np.asarray(shares, float) / np.sum(shares)
@@ -92,5 +108,5 @@ PSF_IMAGES = Stage(
     units_known_after=UNITS_FROM_POINTINGS,
     on_demand=True,
     unit="visit and detector",
-    summary="A unit star at the middle of the detector, sampled eight times finer than its pixels.",
+    summary="PSF at the centre of the detector with the pixel response, sampled eight times per native pixel.",
 )

@@ -1,4 +1,4 @@
-"""Truth index: for each exposure the objects whose light is on it, where, how bright, and which could not be drawn."""
+"""Truth index: position and flux of every object with light on an exposure, or the reason why it is not drawn."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 
 def truth_index(exposures: Exposures) -> TableProduct:
-    """Return the lazy index of a survey's exposures (schema: catalogs/truth_index.yaml), a unit an exposure.
+    """Return the lazy truth index of the exposures of an instrument (schema: catalogs/truth_index.yaml).
 
-    It depends on what its exposure depends on, and is made without drawing it.
+    There is one unit per exposure. It has the same settings and inputs as the exposure, and is made without rendering
+    the exposure.
     """
     renderer = exposures.renderer
 
@@ -38,22 +39,26 @@ def truth_index(exposures: Exposures) -> TableProduct:
 
 @dataclass(frozen=True)
 class MakeIndex:
-    """Makes the index of one exposure."""
+    """Makes the truth index of one exposure."""
 
     render: RenderExposure
+    """Finds the objects of an exposure."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the rows of the exposure at a row of the pointings table."""
+        """Return the truth index of the exposure in a row of the pointings table."""
         view = self.render.view(index)
         return index_of(view, self.render.instrument.bandpass(view.exposure.band).ab_photons())
 
 
-def index_of(view: View, zero: float) -> pd.DataFrame:
-    """Return the index of what an exposure looks at.
+def index_of(view: View, ab_photons: float) -> pd.DataFrame:
+    """Return the truth index of one exposure.
 
     Parameters
     ----------
-    zero : photons per second of AB magnitude 0
+    view : View
+        Scene of the exposure.
+    ab_photons : float, 1/s
+        Photon rate of a source of AB magnitude 0.
     """
     drawable, truth = view.drawable, view.truth
     n = len(drawable.reasons)
@@ -65,7 +70,7 @@ def index_of(view: View, zero: float) -> pd.DataFrame:
     total[drawable.rows] = drawable.scene.fluxes()
     flux[drawn] = total[drawn]
     with np.errstate(divide="ignore"):
-        magnitude = np.where(drawn, -2.5 * np.log10(flux / view.exposure.exptime / zero), np.nan)
+        magnitude = np.where(drawn, -2.5 * np.log10(flux / view.exposure.exptime / ab_photons), np.nan)
     galaxies = len(truth.galaxies)
     frame = pd.DataFrame(
         {
@@ -94,7 +99,7 @@ TRUTH_INDEX = Stage(
     reads=("truth/galaxies", "truth/stars", "calibration"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="visit and detector",
-    summary="Every object with light on the exposure: position, flux, magnitude, or why it is not drawn.",
+    summary="Position, flux and magnitude of every object with light on an exposure, or why it is not drawn.",
     shrink_with="lower render.largest",
     tables={"truth_index": "truth_index/<survey>/"},
 )

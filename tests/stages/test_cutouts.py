@@ -93,7 +93,9 @@ def test_psf_and_jacobian_are_galsims_at_the_place_of_the_object(small, found):
 def test_cutouts_are_lazy_and_read_each_image_once(small, objects, monkeypatch):
     made = []
     monkeypatch.setattr(
-        type(small.product), "load", lambda self, index, names, window: made.append(index) or _blank(names, window)
+        type(small.product.product),
+        "load",
+        lambda self, index, names, window: made.append(index) or _blank(names, window),
     )
     rows = objects.reset_index(drop=True)
     lazy = cutouts(small.product, rows, ("image", "truth"), size=SIZE)

@@ -1,1 +1,1 @@
-"""Coadds: drizzled, warped or drawn tiles, and their PSFs."""
+"""Coadds: tiles that are drizzled, warped or drawn directly, and their PSFs."""

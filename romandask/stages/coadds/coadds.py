@@ -1,7 +1,7 @@
-"""Coadds: tiles in nJy with weight, noise realisation, number of exposures and PSF.
+"""Coadds: tiles in nJy with weight, noise realisations, number of exposures and PSF.
 
-Roman's are drizzled from its exposures, one at a time; Rubin's are drawn directly from its cadence, or warped from the
-exposures of its visits.
+Roman's coadds are drizzled from its exposures, one exposure at a time. Rubin's coadds are drawn directly from its
+cadence, or warped from the exposures of its visits.
 """
 
 from __future__ import annotations
@@ -32,13 +32,23 @@ from romandask.storage.arrays import Variable
 from romandask.storage.manifest import digest
 
 MAKERS: dict[str, type[TileMaker]] = {"drizzle": DrizzleTile, "draw": DrawTile, "warp": WarpTile}
+"""Class that makes the tiles, by `Instrument.coadd`."""
 
 
 def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> Coadds:
-    """Return the lazy coadds of a survey's exposures: dims (tile, band, y, x).
+    """Return the lazy coadds of the exposures of an instrument, with the dims (tile, band, y, x).
 
-    A tile reads its exposures one at a time: from the store where they are, rendered where not. The tiles of an
-    instrument that is drawn from its cadence use the pointings and the truth, and render no exposure.
+    A tile takes its exposures one at a time: stored exposures are read, others are rendered. If the tiles are drawn
+    from a cadence they use only the pointings and the truth, and no exposure is rendered.
+
+    Parameters
+    ----------
+    exposures : Exposures
+        Exposures of the instrument.
+    tiles : list of Tile
+        Tiles to make.
+    settings : CoaddSettings
+        The `coadds` section of the pipeline.
     """
     renderer = exposures.renderer
     instrument, table = renderer.instrument, renderer.table
@@ -62,31 +72,31 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
     if drawn:
         shared |= renderer.render.model_dump()
     elif drizzled:
-        # the arrays are as long as the busiest tile's: with another length all are made again
+        # the length of the arrays of all tiles is that of the tile with most exposures: if it changes, all are remade
         shared["inputs"] = most_inputs(members)
     keys = tuple(members)
 
     def unit(index: int) -> Unit:
         (k, band), chosen = keys[index], members[keys[index]]
-        state: dict[str, Any] = {**shared, "tile": tiles[k].name, "band": band}
+        unit_settings: dict[str, Any] = {**shared, "tile": tiles[k].name, "band": band}
         if drawn:
-            state["exposures"] = digest(values[chosen])
+            unit_settings["exposures"] = digest(values[chosen])
             inputs = renderer.truth.inputs(*cone(footprints[k]))
         else:
-            state["exposures"] = names[chosen].tolist()
+            unit_settings["exposures"] = names[chosen].tolist()
             inputs = tuple((exposures.stage, name) for name in names[chosen])
-        return Unit(f"{tiles[k].name}-{band}", state, inputs, 1.0 + len(chosen))
+        return Unit(name=f"{tiles[k].name}-{band}", settings=unit_settings, inputs=inputs, cost=1.0 + len(chosen))
 
     def coordinates() -> Coordinates:
         headers = [header_text(tile.header(pixels, instrument.coadd_scale)) for tile in tiles]
-        text = {"description": "FITS header of the WCS, 80-column cards"}
+        attributes = {"description": "FITS header of the WCS, 80-column cards"}
         return {
             "tile": (("tile",), np.array([tile.name for tile in tiles], object), {}),
             "band": (("band",), np.array(instrument.bands, object), {}),
             "tile_id": (("tile",), np.array([tile.id for tile in tiles]), {}),
             "ra": (("tile",), np.array([tile.ra for tile in tiles]), {"units": "deg"}),
             "dec": (("tile",), np.array([tile.dec for tile in tiles]), {"units": "deg"}),
-            "header": (("tile",), np.array(headers, object), text),
+            "header": (("tile",), np.array(headers, object), attributes),
         }
 
     planes = 2 + settings.noise
@@ -95,20 +105,20 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
         stage=f"coadds/{instrument.name}",
         units=LazyUnits(tuple(f"{tiles[k].name}-{band}" for k, band in keys), unit),
         make=maker,
-        variables=_planes(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
+        variables=_variables(pixels, settings.noise, psf_side(instrument), most_inputs(members) if drizzled else None),
         axes=("tile", "band"),
         lengths=(len(tiles), len(instrument.bands)),
         coordinates=coordinates,
         attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        # sums, sets and marks; the exposure that is added, its light and its noise, and what is read at a time
+        # sums, sets and dq; the exposure that is being added, its image, its noise and the chunks that are read
         bytes_per_unit=max(
             pixels**2 * ((3 if drizzled else 45) + 4 * planes)
             + (0 if drawn else max(int(np.prod(instrument.shape)) * 18, pixels * 25_000))
             + (300 << 20 if drawn else 50 << 20),
-            # the PSFs of exposures are sampled before, whatever the size of the tile
+            # sampling the PSFs of the exposures, which does not depend on the size of the tile
             0 if drawn else 700 << 20,
         ),
-        # a drizzled exposure seldom covers a whole tile
+        # an exposure seldom covers a whole tile
         seconds_per_unit=pixels**2 * (6e-7 if drawn else 2e-7 + 2.5e-8 * float(mean)),
         tables={"sets": schema("sets")} if drizzled else {},
     )
@@ -116,7 +126,22 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
 
 
 def _members(table: pd.DataFrame, tiles: np.ndarray, bands: tuple[str, ...]) -> dict[tuple[int, str], np.ndarray]:
-    """Return the rows of the exposures that touch each tile (tiles, 4, 2), by tile and band, in order."""
+    """Return the rows of the exposures that touch each tile, in ascending order.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Pointings table.
+    tiles : ndarray, shape (tiles, 4, 2), degrees
+        Corners of the tiles.
+    bands : tuple of str
+        Bands of the instrument.
+
+    Returns
+    -------
+    dict of (int, str) to ndarray of int
+        Rows in the pointings table, by index of the tile and band.
+    """
     e, t = touching_pairs(corners_of(table), tiles)
     code = table["band"].map({band: number for number, band in enumerate(bands)}).to_numpy()[e]
     group = t * len(bands) + code
@@ -126,31 +151,58 @@ def _members(table: pd.DataFrame, tiles: np.ndarray, bands: tuple[str, ...]) -> 
     return {(k // len(bands), bands[k % len(bands)]): part for k, part in enumerate(parts)}
 
 
-def _planes(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Variable, ...]:
-    """Return the arrays of a tile: `inputs` exposures at most are drizzled, or None where none is."""
-    shape, axes = (pixels, pixels), ("y", "x")
-    text = "noise realisations with the image's correlations"
+def _variables(pixels: int, noise: int, psf: int, inputs: int | None) -> tuple[Variable, ...]:
+    """Return the arrays of a tile.
+
+    Parameters
+    ----------
+    pixels : int
+        Side of a tile, pixels.
+    noise : int
+        Number of noise realisations.
+    psf : int
+        Side of the PSF images, pixels.
+    inputs : int or None
+        Largest number of exposures of a drizzled tile; None for tiles that are not drizzled.
+    """
+
+    def plane(name: str, dtype: str, attributes: dict[str, Any]) -> Variable:
+        return Variable(name=name, dtype=dtype, shape=(pixels, pixels), axes=("y", "x"), attributes=attributes)
+
     flags = {"flag_masks": [SATURATED], "flag_meanings": "saturated"}
-    found = [
-        Variable("image", "float32", shape, axes, {"units": "nJy", "long_name": "flux of a pixel"}),
+    variables = [
+        plane("image", "float32", {"units": "nJy", "long_name": "flux of a pixel"}),
+        plane("weight", "float32", {"units": "s" if inputs else "1/nJy2", "long_name": "sum of weights"}),
         Variable(
-            "weight",
-            "float32",
-            shape,
-            axes,
-            {"units": "s" if inputs else "1/nJy2", "long_name": "sum of weights"},
+            name="noise",
+            dtype="float32",
+            shape=(noise, pixels, pixels),
+            axes=("realisation", "y", "x"),
+            attributes={"units": "nJy", "long_name": "noise realisations with the image's correlations"},
         ),
-        Variable("noise", "float32", (noise, *shape), ("realisation", *axes), {"units": "nJy", "long_name": text}),
-        Variable("nimages", "uint16", shape, axes, {"long_name": "number of exposures"}),
-        Variable("dq", "uint8", shape, axes, {"long_name": "data quality", **flags}),
-        Variable("psf", "float32", (psf, psf), ("v", "u"), {"long_name": "unit star of flat f_nu, mean over the tile"}),
+        plane("nimages", "uint16", {"long_name": "number of exposures"}),
+        plane("dq", "uint8", {"long_name": "data quality", **flags}),
+        Variable(
+            name="psf",
+            dtype="float32",
+            shape=(psf, psf),
+            axes=("v", "u"),
+            attributes={"long_name": "unit star of flat f_nu, mean over the tile"},
+        ),
     ]
     if inputs:
-        # of the hundreds of visits that Rubin's tiles have there are more sets than can be numbered
-        found.append(Variable("set", "uint16", shape, axes, {"long_name": "number of the set of exposures"}))
-        text = "unit star of flat f_nu of each exposure, as it is drizzled"
-        found.append(Variable("input_psf", "float32", (inputs, psf, psf), ("input", "v", "u"), {"long_name": text}))
-    return tuple(found)
+        # tiles of Rubin have no sets: with hundreds of visits there are more sets than can be numbered
+        variables += [
+            plane("set", "uint16", {"long_name": "number of the set of exposures"}),
+            Variable(
+                name="input_psf",
+                dtype="float32",
+                shape=(inputs, psf, psf),
+                axes=("input", "v", "u"),
+                attributes={"long_name": "unit star of flat f_nu of each exposure, as it is drizzled"},
+            ),
+        ]
+    return tuple(variables)
 
 
 def build_coadds(context: SurveyContext, survey: str) -> Coadds:
@@ -165,8 +217,8 @@ COADDS = Stage(
     reads=("exposures", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="tile and band",
-    summary="Image, weight, noise realisations, number and sets of exposures, PSFs: drizzled from exposures (square "
-    "kernel, exact overlaps), warped from visits, or drawn from the cadence at its depth.",
+    summary="Image, weight, noise realisations, number of exposures and PSF of a tile, drizzled from exposures (square "
+    "kernel, exact overlaps), warped from visits or drawn from the cadence at its depth.",
     shrink_with="lower coadds.pixels",
     tables={"sets": "coadds/<survey>_sets/"},
 )

@@ -1,4 +1,4 @@
-"""Tiles of a coadd that are drawn from a cadence: the expectation with the effective PSF, and the stack's noise."""
+"""Tiles of a coadd that are drawn from a cadence: the expected image with the mean PSF, and the noise of the stack."""
 
 from __future__ import annotations
 
@@ -24,47 +24,50 @@ from romandask.stages.pointings import corners_of
 
 @dataclass(frozen=True)
 class DrawTile(TileMaker):
-    """Makes one tile and band from the cadence: the expectation with the effective PSF, and the stack's noise."""
+    """Makes a tile in one band from the cadence, without rendering exposures.
+
+    The expected image is drawn once, with the weighted mean PSF of the exposures, and the noise is that of their stack.
+    """
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages, dq and the PSF."""
-        renderer, here = self.exposures.renderer, self.unit(index)
+        """Return image, weight, noise, nimages, dq and psf of a unit."""
+        renderer, unit = self.exposures.renderer, self.unit(index)
         instrument = renderer.instrument
-        tile, band, wcs = here.tile, here.band, here.wcs
+        tile, band, wcs = unit.tile, unit.band, unit.wcs
         shape = (self.pixels, self.pixels)
         bandpass = instrument.bandpass(band)
-        rows = renderer.table.iloc[here.members]
-        chosen = [exposure_of(row) for _, row in rows.iterrows()]
+        rows = renderer.table.iloc[unit.members]
+        exposures = [exposure_of(row) for _, row in rows.iterrows()]
         to_njy = NJY_ZERO_POINT / bandpass.ab_photons()
-        gains = np.array([exposure.exptime for exposure in chosen]) / to_njy
-        variances = (np.array([instrument.pixel_noise(exposure) for exposure in chosen]) / gains) ** 2
+        gains = np.array([exposure.exptime for exposure in exposures]) / to_njy
+        variances = (np.array([instrument.pixel_noise(exposure) for exposure in exposures]) / gains) ** 2
         corners = corners_of(rows)
         polygons = np.stack(wcs.all_world2pix(corners[..., 0].ravel(), corners[..., 1].ravel(), 0, quiet=True), -1)
         layers = stack(polygons.reshape(-1, 4, 2), variances, gains, shape)
-        made = {"weight": layers.weight, "nimages": layers.count, "dq": np.zeros(shape, np.uint8)}
+        planes = {"weight": layers.weight, "nimages": layers.count, "dq": np.zeros(shape, np.uint8)}
         realisations = self.settings.noise
         if not layers.shares.any():
             side = psf_side(instrument)
             blank = np.zeros((realisations, *shape), np.float32)
-            return {**made, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
+            return {**planes, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
         truth = renderer.truth.near(*cone(tile.corners(self.settings.grid().side)))
         scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
-        psf = instrument.effective_psf(chosen, layers.shares)
+        psf = instrument.effective_psf(exposures, layers.shares)
         stamps = plan_stamps(scene, psf.edges, shape, faintest, self.render.largest)
         covered = layers.weight > 0
         expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
-        empty = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
-        light = rng(self.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        empty_variance = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
+        normal = rng(self.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
         noise = np.empty((realisations, *shape), np.float32)
         for number, plane in enumerate(noise):
-            other = rng(self.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
-            other.standard_normal(out=plane, dtype=np.float32)
-            plane *= np.sqrt(empty)
-        image = expected + light * np.sqrt(empty + layers.source * np.maximum(expected, 0))
-        # as the exposures' would be: the light of all that is too faint to be seen goes with the sky's
+            generator = rng(self.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
+            generator.standard_normal(out=plane, dtype=np.float32)
+            plane *= np.sqrt(empty_variance)
+        image = expected + normal * np.sqrt(empty_variance + layers.source * np.maximum(expected, 0))
+        # the background is subtracted as from exposures, because it contains the light of undetected objects
         return {
-            **made,
+            **planes,
             "image": np.where(covered, subtract_background(image.astype(np.float32), ~covered), 0),
             "noise": noise,
             "psf": _star(psf, bandpass, psf_side(instrument)),
@@ -72,7 +75,7 @@ class DrawTile(TileMaker):
 
 
 def _star(psf: PsfModel, bandpass: Bandpass, side: int) -> np.ndarray:
-    """Return a unit star (side, side) of flat f_nu in the middle."""
+    """Return the image of a star of unit flux and flat f_nu at the centre, shape (side, side)."""
     middle = np.array([(side - 1) / 2])
     scene = Scene(
         x=middle,

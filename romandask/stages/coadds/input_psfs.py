@@ -1,9 +1,10 @@
-"""PSFs of drizzled coadds: of each exposure as it enters a tile, and of a star anywhere as the coadd has it."""
+"""PSFs of drizzled coadds: the PSF of each input exposure on a tile, and images of stars at any position."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from astropy.wcs import WCS
@@ -16,51 +17,86 @@ from romandask.kernels.coadding.pixel_map import pixel_map
 from romandask.model.tiles import tangent_header
 from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
-RADIUS = 3.0
-"""Half the side of the PSF images, arcsec, for a pixel of 0.0575 arcsec; larger pixels get larger images."""
+PSF_RADIUS = 3.0
+"""Half the side of the PSF images, arcsec (Roman: tile pixels of 0.0575 arcsec); above 0.1 arcsec it is proportional to
+the tile pixel."""
 
 
 def psf_side(instrument: Instrument) -> int:
-    """Return the side of the PSF images of an instrument's coadds, pixels, odd."""
-    radius = RADIUS * max(1.0, instrument.coadd_scale / 0.1)
+    """Return the side of the PSF images of the coadds of an instrument, pixels; an odd number."""
+    radius = PSF_RADIUS * max(1.0, instrument.coadd_scale / 0.1)
     return 2 * int(round(radius / instrument.coadd_scale)) + 1
 
 
 @dataclass(frozen=True)
-class _Middle:
-    """The middle of the detector of all exposures with one PSF."""
+class _CachedExposure:
+    """An exposure as a cache key: exposures with the same PSF are equal."""
 
-    key: tuple
+    key: tuple[Any, ...]
+    """Result of `Instrument.psf_key`."""
     instrument: Instrument = field(compare=False)
     exposure: Exposure = field(compare=False)
 
 
 @lru_cache(maxsize=40)
-def _middle_image(middle: _Middle) -> np.ndarray:
-    ny, nx = middle.instrument.shape
-    return psf_image(middle.instrument, middle.exposure, (nx - 1) / 2, (ny - 1) / 2).astype(np.float32)
+def _centre_psf(cached: _CachedExposure) -> np.ndarray:
+    """Return the oversampled PSF at the centre of the detector (see `psf_image`)."""
+    ny, nx = cached.instrument.shape
+    return psf_image(cached.instrument, cached.exposure, (nx - 1) / 2, (ny - 1) / 2).astype(np.float32)
 
 
 def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:
-    """Return d(x, y on the target) / d(x, y on the source), (2, 2), at a place on the source."""
-    near = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]]) + [x, y]
-    there = np.stack(target.all_world2pix(*source.all_pix2world(*near.T, 0), 0, quiet=True))
-    return np.stack([there[:, 0] - there[:, 1], there[:, 2] - there[:, 3]], axis=1)
+    """Return the derivative of the position on a target image with respect to the position on a source image.
+
+    Parameters
+    ----------
+    source, target : WCS
+        WCSs of the images.
+    x, y : float, pixels
+        Position on the source.
+
+    Returns
+    -------
+    ndarray, shape (2, 2), target pixels per source pixel
+        d(x, y on the target) / d(x, y on the source), as a finite difference over one pixel.
+    """
+    on_source = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]]) + [x, y]
+    on_target = np.stack(target.all_world2pix(*source.all_pix2world(*on_source.T, 0), 0, quiet=True))
+    return np.stack([on_target[:, 0] - on_target[:, 1], on_target[:, 2] - on_target[:, 3]], axis=1)
 
 
 def input_psf(
     instrument: Instrument, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float
 ) -> np.ndarray:
-    """Return a unit star of flat f_nu (side, side) of an exposure as it enters the tile around a position.
+    """Return the PSF of one exposure of a drizzled tile: the drizzled image of a star of unit flux and flat f_nu.
 
-    It is the PSF in the middle of the detector (Troxel et al. 2023, section 5.2), turned as the exposure is there.
+    It is the PSF at the centre of the detector (Troxel et al. 2023, section 5.2), with the orientation and distortion
+    of the exposure at the centre of the tile.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Instrument of the exposure.
+    exposure : Exposure
+        The exposure.
+    source : WCS
+        WCS of the exposure.
+    ra, dec : float, degrees
+        Centre of the tile.
+    pixfrac : float
+        Side of a drop over the side of a native pixel.
+
+    Returns
+    -------
+    ndarray, shape (side, side), float32
+        Image with the pixels of the tile; `side` is that of `psf_side`.
     """
     ny, nx = instrument.shape
     x, y = np.clip(np.array(source.all_world2pix(ra, dec, 0, quiet=True), float), 0, [nx - 1, ny - 1])
-    at = [float(value) for value in source.all_pix2world(x, y, 0)]
+    centre_ra, centre_dec = (float(value) for value in source.all_pix2world(x, y, 0))
     side = psf_side(instrument)
-    target = WCS(tangent_header(*at, side, instrument.coadd_scale))
-    fine = _middle_image(_Middle(instrument.psf_key(exposure), instrument, exposure))
+    target = WCS(tangent_header(centre_ra, centre_dec, side, instrument.coadd_scale))
+    fine = _centre_psf(_CachedExposure(instrument.psf_key(exposure), instrument, exposure))
     return drizzled_psf(fine, OVERSAMPLING, jacobian(source, target, x, y), pixfrac, side).astype(np.float32)
 
 
@@ -74,23 +110,38 @@ def star_on(
     pixfrac: float,
     shares: np.ndarray | None,
 ) -> np.ndarray:
-    """Return a unit star (stamp, stamp) as exposures drizzled on a grid have it, each with its own pixels and PSF.
+    """Return the image of a star of unit flux, drizzled from exposures, each with its own pixels and PSF.
 
     Parameters
     ----------
-    target : of the stamp
-    exposures : with WCS and weight
-    shares : (nodes,) photons of its spectrum by node of the band; those of flat f_nu where none are given
+    target : WCS
+        WCS of the image.
+    stamp : int
+        Side of the image, pixels.
+    ra, dec : float, degrees
+        Position of the star.
+    exposures : list of (Exposure, WCS, float)
+        The exposures, with their WCSs and weights.
+    instrument : Instrument
+        Instrument of the exposures.
+    pixfrac : float
+        Side of a drop over the side of a native pixel.
+    shares : ndarray, shape (nodes,), or None
+        Photons of the star's spectrum at each PSF node of the band, in any unit; None for those of flat f_nu.
+
+    Returns
+    -------
+    ndarray, shape (stamp, stamp), float32
     """
     sums = Sums((stamp, stamp), 1, pixfrac)
     for exposure, source, weight in exposures:
         x, y = (float(value) for value in source.all_world2pix(ra, dec, 0))
-        change = jacobian(source, target, x, y)
-        half = int(np.ceil(0.75 * stamp / np.sqrt(abs(np.linalg.det(change))))) + 2
+        area = abs(np.linalg.det(jacobian(source, target, x, y)))
+        half = int(np.ceil(0.75 * stamp / np.sqrt(area))) + 2
         column, row = round(x), round(y)
         fine = psf_image(instrument, exposure, x, y, shares)
-        star = native_star(fine, OVERSAMPLING, half, x - column, y - row) / abs(np.linalg.det(change))
+        star = native_star(fine, OVERSAMPLING, half, x - column, y - row) / area
         rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-        light = np.full(star.shape, weight, np.float32)
-        sums.add([([star], light, pixel_map(source, target, rows, columns))])
+        weights = np.full(star.shape, weight, np.float32)
+        sums.add([([star], weights, pixel_map(source, target, rows, columns))])
     return sums.means()[0]

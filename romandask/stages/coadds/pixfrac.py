@@ -1,4 +1,4 @@
-"""Which pixfrac suits a survey's dithers: the smallest whose coadds have no empty pixels and an even weight."""
+"""Choice of pixfrac for the dithers of a survey: the smallest whose coadds have no empty pixels and an even weight."""
 
 from __future__ import annotations
 
@@ -15,39 +15,42 @@ from romandask.model.tiles import tangent_header
 from romandask.stages.coadds.tile_maker import Coadds
 
 CHOICES = np.round(np.arange(0.3, 1.001, 0.1), 1)
-UNEVEN = 0.2
-"""Rms over median of the weight that is tolerated (Troxel et al. 2023, section 5.1; Fruchter & Hook 2002)."""
+"""Values of pixfrac that are compared."""
+MAX_UNEVENNESS = 0.2
+"""Largest ratio of rms to median of the weight (Troxel et al. 2023, section 5.1; Fruchter & Hook 2002)."""
 TEST_SQUARE_PIXELS = 300
-"""Pixels, a side, of the square in which it is measured."""
+"""Side of the square in which the weight is measured, pixels."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a pixfrac does to one band in the middle of a tile."""
+    """Weight of a coadd in one band with one pixfrac, measured in a square at the centre of a tile."""
 
     band: str
     pixfrac: float
     exposures: int
+    """Number of exposures that touch the square."""
     empty: float
-    """Share of pixels without weight."""
+    """Fraction of pixels without weight."""
     uneven: float
-    """Rms of the weight over its median."""
+    """Ratio of rms to median of the weight."""
 
     @property
     def good(self) -> bool:
-        """Whether it can be recommended."""
-        return self.empty == 0 and self.uneven < UNEVEN
+        """Whether the pixfrac can be recommended for the band."""
+        return self.empty == 0 and self.uneven < MAX_UNEVENNESS
 
 
 def coverage(coadds: Coadds) -> list[Coverage]:
-    """Return what each pixfrac of CHOICES does to each band, from the places of the exposures alone.
+    """Return the coverage of each band with each pixfrac of CHOICES.
 
-    It is measured in the middle of the tile that has the most exposures, with every pixel of them good.
+    It is measured at the centre of the tile with the most exposures, from the WCSs of the exposures alone: all their
+    pixels are taken to be good.
 
     Raises
     ------
     UserError
-        If the coadds are not drizzled, or a band has no exposure there.
+        If the coadds are not drizzled, or there is no exposure in a band.
     """
     maker, table = coadds.maker, coadds.exposures.table
     if coadds.instrument.coadd != "drizzle":
@@ -56,31 +59,37 @@ def coverage(coadds: Coadds) -> list[Coverage]:
     totals = [sum(len(maker.members[k, band]) for band in instrument.bands) for k in range(len(maker.tiles))]
     k = int(np.argmax(totals))
     target = WCS(tangent_header(maker.tiles[k].ra, maker.tiles[k].dec, TEST_SQUARE_PIXELS, scale))
-    found = []
+    results = []
     for band in instrument.bands:
-        seen = []
+        inputs = []
         for i in maker.members[k, band]:
             exposure = exposure_of(table.iloc[i])
             wcs = WCS(instrument.header(exposure))
             parts = strips(wcs, instrument.shape, target, (TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS))
             if parts:
-                seen.append((exposure.exptime, [pixel_map(wcs, target, part.rows, part.columns) for part in parts]))
-        if not seen:
+                inputs.append((exposure.exptime, [pixel_map(wcs, target, part.rows, part.columns) for part in parts]))
+        if not inputs:
             raise UserError(f"pixfrac: no exposure of {band} on the middle of tile {maker.tiles[k].name}")
         for choice in CHOICES:
             sums = Sums((TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS), 1, float(choice))
-            for seconds, maps in seen:
-                planes = [np.full(one.shape, seconds, np.float32) for one in maps]
-                sums.add(([plane], plane, one) for plane, one in zip(planes, maps, strict=True))
+            for seconds, maps in inputs:
+                planes = [np.full(strip_map.shape, seconds, np.float32) for strip_map in maps]
+                sums.add(([plane], plane, strip_map) for plane, strip_map in zip(planes, maps, strict=True))
             weight = sums.weight[2:-2, 2:-2]
-            middle = max(float(np.median(weight)), 1e-30)
-            found.append(
-                Coverage(band, float(choice), len(seen), float((weight <= 0).mean()), float(weight.std() / middle))
+            median = max(float(np.median(weight)), 1e-30)
+            results.append(
+                Coverage(
+                    band=band,
+                    pixfrac=float(choice),
+                    exposures=len(inputs),
+                    empty=float((weight <= 0).mean()),
+                    uneven=float(weight.std() / median),
+                )
             )
-    return found
+    return results
 
 
 def advice(found: list[Coverage]) -> float | None:
-    """Return the smallest pixfrac that is good in all bands; None where there is none."""
-    good = [choice for choice in CHOICES if all(one.good for one in found if one.pixfrac == choice)]
+    """Return the smallest pixfrac that is good in all bands, or None if there is none."""
+    good = [choice for choice in CHOICES if all(result.good for result in found if result.pixfrac == choice)]
     return float(good[0]) if good else None

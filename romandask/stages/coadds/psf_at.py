@@ -1,16 +1,16 @@
-"""The PSF of a drizzled coadd anywhere: from the exposures that a place has, each with its own PSF there."""
+"""PSF at a position on a drizzled coadd, from the PSFs of the exposures that contribute at the position."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of
-from romandask.instruments.instrument import Instrument
 from romandask.kernels.coadding.coadd_psf import drizzled_psf
 from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
@@ -19,18 +19,21 @@ from romandask.stages.coadds.tile_maker import Coadds
 from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
-"""Photons per nm, in any unit, at wavelengths in nm: a `galsim.SED`, for example."""
+"""Function that returns photons per nm, in any unit, at wavelengths in nm; for example a `galsim.SED`."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """An exposure that sees a place."""
+class ExposureAt:
+    """An exposure that contains a position on the sky."""
 
     name: str
     exposure: Exposure
     wcs: WCS
+    """WCS of the exposure."""
     x: float
+    """Position on the detector along x, pixels."""
     y: float
+    """Position on the detector along y, pixels."""
 
 
 def coadd_psf(
@@ -42,29 +45,47 @@ def coadd_psf(
     scale: float | None = None,
     spectrum: Spectrum | None = None,
 ) -> xr.DataArray:
-    """Return the image of a unit star at a place of a drizzled coadd, dims (v, u), axes those of the tile.
+    """Return the image of a star of unit flux at a position on a drizzled coadd.
+
+    The PSF is that of the exposures that contribute to the pixel at the position (Troxel et al. 2023, section 5.2). If
+    the tile is stored, these are the exposures of the set of the pixel; otherwise all exposures whose detectors contain
+    the position.
 
     Parameters
     ----------
-    ra, dec : degrees
-    stamp : pixels a side; that of the stored PSFs where none is given
-    scale : arcsec between samples, each the share of light in a pixel of the coadd that is centred there, the star in
-        the middle: the mean over all places that a star may have in the pixels of its exposures. None for the pixels
-        of the coadd themselves, and for the very places of this star: what the coadd has of it, undersampled as its
-        exposures are. The attributes `x` and `y` then tell where in the stamp it is centred.
-    spectrum : of the star; flat f_nu where none is given
+    coadds : Coadds
+        The coadds; they must be drizzled.
+    ra, dec : float, degrees
+        Position.
+    band : str
+        Band of the coadd.
+    stamp : int, pixels, optional
+        Side of the image; by default that of the stored PSFs.
+    scale : float, arcsec, optional
+        Distance between samples. The star is then in the middle of the image. A sample is the share of the light in a
+        tile pixel that is centred on the sample, averaged over all positions of a star within the pixels of its
+        exposures. By default the image has the pixels of the tile and shows this star as it is drizzled from its
+        exposures, and so undersampled as they are.
+    spectrum : Spectrum, optional
+        Spectrum of the star; by default flat f_nu.
 
-    The exposures are those of the place's set, where the tile is stored, else all whose detectors hold the place
-    (Troxel et al. 2023, section 5.2). Attributes: tile, exposures, pixel_scale.
+    Returns
+    -------
+    DataArray, dims (v, u)
+        Image with the axes of the tile. Attributes: name of the tile (`tile`), names of the exposures (`exposures`),
+        position of the star on the image (`x`, `y`, pixels) and `pixel_scale` (arcsec).
 
     Raises
     ------
     UserError
-        If the survey has no such band, or no exposure at the place.
+        If the coadds are not drizzled, there is no such band, the position is outside the tiles or on no exposure, or
+        the spectrum gives no photons in the band or negative ones.
     """
     maker, instrument = coadds.maker, coadds.instrument
     if instrument.coadd != "drizzle":
-        raise UserError("PSFs at a place are those of drizzled coadds: of others each tile has one, its array psf")
+        raise UserError(
+            "PSFs at a position exist only for drizzled coadds: a tile of other coadds has one PSF, its array psf"
+        )
     if band not in instrument.bands:
         raise UserError(f"band {band!r}: this survey has {', '.join(instrument.bands)}")
     owner = int(maker.settings.grid().owner(ra, dec))
@@ -74,54 +95,76 @@ def coadd_psf(
     tile, index = maker.tiles[tiles[0]], coadds.index(tiles[0], band)
     header = maker.header(tiles[0])
     target = WCS(header)
-    seen = _seen(coadds, index, maker.members[tiles[0], band], instrument, ra, dec, target)
-    if not seen:
+    inputs = _exposures_at(coadds, index, maker.members[tiles[0], band], ra, dec, target)
+    if not inputs:
         raise UserError(f"({ra}, {dec}): no exposure of {band} there")
     stamp = psf_side(instrument) if stamp is None else stamp
     shares = None if spectrum is None else _shares(spectrum, instrument.bandpass(band))
-    attributes = {"tile": tile.name, "exposures": [one.name for one in seen]}
+    attributes: dict[str, Any] = {"tile": tile.name, "exposures": [each.name for each in inputs]}
     if scale is None:
         x, y = (float(value) for value in target.all_world2pix(ra, dec, 0))
         low_x, low_y = round(x) - stamp // 2, round(y) - stamp // 2
-        here = WCS({**header, "CRPIX1": header["CRPIX1"] - low_x, "CRPIX2": header["CRPIX2"] - low_y})
-        inputs = [(one.exposure, one.wcs, one.exposure.exptime) for one in seen]
-        image = star_on(here, stamp, ra, dec, inputs, instrument, maker.settings.pixfrac, shares)
+        stamp_wcs = WCS({**header, "CRPIX1": header["CRPIX1"] - low_x, "CRPIX2": header["CRPIX2"] - low_y})
+        weighted = [(each.exposure, each.wcs, each.exposure.exptime) for each in inputs]
+        image = star_on(stamp_wcs, stamp, ra, dec, weighted, instrument, maker.settings.pixfrac, shares)
         attributes |= {"x": x - low_x, "y": y - low_y, "pixel_scale": instrument.coadd_scale}
         return xr.DataArray(image, dims=("v", "u"), attrs=attributes)
     total, weight = np.zeros((stamp, stamp)), 0.0
-    for one in seen:
-        change = jacobian(one.wcs, target, one.x, one.y)
-        fine = psf_image(instrument, one.exposure, one.x, one.y, shares)
+    for each in inputs:
+        derivative = jacobian(each.wcs, target, each.x, each.y)
+        fine = psf_image(instrument, each.exposure, each.x, each.y, shares)
         step = scale / instrument.coadd_scale
-        total += one.exposure.exptime * drizzled_psf(fine, OVERSAMPLING, change, maker.settings.pixfrac, stamp, step)
-        weight += one.exposure.exptime
+        psf = drizzled_psf(fine, OVERSAMPLING, derivative, maker.settings.pixfrac, stamp, step)
+        total += each.exposure.exptime * psf
+        weight += each.exposure.exptime
     middle = (stamp - 1) / 2
     attributes |= {"x": middle, "y": middle, "pixel_scale": scale}
     return xr.DataArray((total / weight).astype(np.float32), dims=("v", "u"), attrs=attributes)
 
 
-def _seen(
-    coadds: Coadds, index: int, members: np.ndarray, instrument: Instrument, ra: float, dec: float, target: WCS
-) -> list[Seen]:
-    """Return the exposures, of those that touch a tile, of which a place of it is made."""
-    table = coadds.exposures.table
+def _exposures_at(
+    coadds: Coadds, index: int, members: np.ndarray, ra: float, dec: float, target: WCS
+) -> list[ExposureAt]:
+    """Return the exposures that contribute at a position on a tile.
+
+    Parameters
+    ----------
+    coadds : Coadds
+        The coadds.
+    index : int
+        Index of the unit of the tile and band.
+    members : ndarray of int
+        Rows in the pointings table of the exposures that touch the tile.
+    ra, dec : float, degrees
+        Position.
+    target : WCS
+        WCS of the tile.
+    """
+    table, instrument = coadds.exposures.table, coadds.instrument
     if coadds.has(index):
         column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
-        found = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))
-        sets = found["sets"]
-        members = members[sets["input"][sets["set"] == int(found["set"].item())].to_numpy()]
-    seen = []
+        loaded = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))
+        sets = loaded["sets"]
+        members = members[sets["input"][sets["set"] == int(loaded["set"].item())].to_numpy()]
+    inputs = []
     ny, nx = instrument.shape
     for i in members:
         exposure = exposure_of(table.iloc[i])
         wcs = WCS(instrument.header(exposure))
         x, y = (float(value) for value in wcs.all_world2pix(ra, dec, 0, quiet=True))
         if -0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5:
-            seen.append(Seen(coadds.exposures.names[i], exposure, wcs, x, y))
-    return seen
+            inputs.append(ExposureAt(coadds.exposures.names[i], exposure, wcs, x, y))
+    return inputs
 
 
 def _shares(spectrum: Spectrum, bandpass: Bandpass) -> np.ndarray:
+    """Return the photons of a spectrum at each PSF node of a band, shape (nodes,).
+
+    Raises
+    ------
+    UserError
+        If there are no photons in the band, or negative or non-finite ones.
+    """
     photons = (np.array([float(spectrum(wave)) for wave in bandpass.wave]) * bandpass.weights) @ bandpass.node_weights()
     if not (np.isfinite(photons).all() and photons.min() >= 0 and photons.sum() > 0):
         raise UserError("spectrum: it must give photons in the band, none negative")

@@ -1,4 +1,4 @@
-"""The tiles of a coadd, the exposures that touch them, and what the ways of making them share."""
+"""Tiles of a coadd, the exposures that touch them, and the common base of the methods that make coadds."""
 
 from __future__ import annotations
 
@@ -14,139 +14,142 @@ from romandask.model.settings import CoaddSettings, RenderSettings
 from romandask.model.tiles import Tile
 from romandask.products.image_set import ImageSet
 from romandask.stages.exposures.exposures import Exposures
-from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 
 
 @dataclass(frozen=True)
 class TileBand:
-    """A unit of a coadd: one tile in one band."""
+    """One unit of a coadd: a tile in a band."""
 
     tile: Tile
     band: str
     members: np.ndarray
-    """Rows of the exposures that touch the tile."""
+    """Rows in the pointings table of the exposures in the band that touch the tile."""
     wcs: WCS
+    """WCS of the tile."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TileMaker:
-    """Makes the units of a coadd; a way of making them is a subclass."""
+    """Makes the units of a coadd. Each method (drizzling, warping, drawing) is a subclass."""
 
     exposures: Exposures
+    """Exposures that the tiles are made from."""
     tiles: tuple[Tile, ...]
     members: dict[tuple[int, str], np.ndarray]
-    """Rows of the exposures that touch a tile, by its number and band."""
+    """Rows in the pointings table of the exposures that touch a tile, by index of the tile and band."""
     settings: CoaddSettings
     pixels: int
-    """Side of a tile."""
+    """Side of a tile, pixels."""
     render: RenderSettings
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Return image, weight, noise, nimages, dq and PSF of a unit, and what else the way of making it has."""
+        """Return image, weight, noise, nimages, dq and psf of a unit, and the other arrays and tables of the method."""
         raise NotImplementedError
 
     @property
     def seed(self) -> int:
-        """Of the survey."""
+        """Seed of the survey."""
         return self.exposures.renderer.seed
 
     @property
     def instrument(self) -> Instrument:
-        """The instrument of the exposures."""
+        """Instrument of the exposures."""
         return self.exposures.instrument
 
     def unit(self, index: int) -> TileBand:
-        """Return the tile and band of a unit."""
+        """Return the tile and band of the unit with an index."""
         k, b = divmod(index, len(self.instrument.bands))
         band = self.instrument.bands[b]
         return TileBand(self.tiles[k], band, self.members[k, band], self.wcs(k))
 
-    def header(self, tile: int) -> dict:
-        """Return the FITS header of the WCS of a tile, by its number."""
+    def header(self, tile: int) -> dict[str, Any]:
+        """Return the FITS header with the WCS of the tile with an index."""
         return self.tiles[tile].header(self.pixels, self.instrument.coadd_scale)
 
     def wcs(self, tile: int) -> WCS:
-        """Return the WCS of a tile, by its number."""
+        """Return the WCS of the tile with an index."""
         return WCS(self.header(tile))
 
 
 def unit_of(tile: int, band: str, bands: tuple[str, ...]) -> int:
-    """Return the number of the unit of a tile and band: of a tile one a band, in their order."""
+    """Return the index of the unit of a tile (by index) and band; the units of a tile are in the order of `bands`."""
     return tile * len(bands) + bands.index(band)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Coadds(ImageSet):
-    """The coadds of one instrument: lazy images (tile, band, y, x), and what makes them."""
+    """The coadds of one instrument: lazy images with the dims (tile, band, y, x), and the object that makes them."""
 
     maker: TileMaker
+    """Makes the units of the product."""
 
     @property
     def exposures(self) -> Exposures:
-        """The exposures that they are made of; of an instrument that is drawn from its cadence never rendered."""
+        """Exposures that the coadds are made from. They are never rendered if the coadds are drawn from a cadence."""
         return self.maker.exposures
 
     @property
     def instrument(self) -> Instrument:
-        """The instrument."""
+        """Instrument of the exposures."""
         return self.maker.instrument
 
     @property
     def truth(self) -> TruthCatalogs:
-        """The truth under them."""
+        """Truth catalogs that the exposures show."""
         return self.exposures.renderer.truth
 
     @property
     def tiles(self) -> tuple[Tile, ...]:
-        """The tiles."""
+        """Tiles of the survey."""
         return self.maker.tiles
 
     @property
     def pixels(self) -> int:
-        """Pixels along a side of a tile."""
+        """Side of a tile, pixels."""
         return self.maker.pixels
 
     @property
     def settings(self) -> CoaddSettings:
-        """The section `coadds` of the pipeline."""
+        """The `coadds` section of the pipeline."""
         return self.maker.settings
 
     @property
     def footprints(self) -> np.ndarray:
-        """(n, 4, 2) corners of the units, degrees."""
+        """Corners of the units, shape (n, 4, 2), degrees."""
         side = self.settings.grid().side
         corners = np.stack([tile.corners(side) for tile in self.tiles])
         return np.repeat(corners, len(self.instrument.bands), axis=0)
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """(ny, nx) of a tile."""
+        """Rows and columns of a tile."""
         return self.pixels, self.pixels
 
     @property
     def unit_bands(self) -> np.ndarray:
-        """(n,) band of each unit."""
+        """Band of each unit, shape (n,)."""
         return np.array(self.instrument.bands * len(self.tiles), object)
 
     @property
     def extra_layers(self) -> dict[str, tuple[str, str, str]]:
-        """Layers of cutouts beside the stored arrays: none."""
+        """Layers of cutouts that are not stored: none."""
         return {}
 
     def index(self, tile: int, band: str) -> int:
-        """Return the number of the unit of a tile and band."""
+        """Return the index of the unit of a tile (by index) and band."""
         return unit_of(tile, band, self.instrument.bands)
 
     def tile_band(self, index: int) -> TileBand:
-        """Return the tile and band of a unit."""
+        """Return the tile and band of the unit with an index."""
         return self.maker.unit(index)
 
-    def header(self, index: int) -> dict:
-        """Return the FITS header of the WCS of a unit."""
+    def header(self, index: int) -> dict[str, Any]:
+        """Return the FITS header with the WCS of the unit with an index."""
         return self.maker.header(index // len(self.instrument.bands))
 
     def wcs(self, tile: int) -> WCS:
-        """Return the WCS of a tile, by its number."""
+        """Return the WCS of the tile with an index."""
         return self.maker.wcs(tile)
 
     def make_layers(
@@ -156,9 +159,9 @@ class Coadds(ImageSet):
         window: tuple[slice, slice],
         arrays: dict[str, np.ndarray],
     ) -> dict[str, np.ndarray]:
-        """Return no layers: all are stored."""
+        """Return no layers, because all layers of coadds are stored."""
         return {}
 
     def make_psfs(self, index: int, positions: np.ndarray, size: int) -> np.ndarray:
-        """Raise NotImplementedError: PSF cutouts are those of exposures; `survey.psf` is that of a coadd."""
+        """Raise NotImplementedError: only exposures have PSF cutouts; for coadds see `Survey.psf`."""
         raise NotImplementedError("PSF cutouts are those of exposures")

@@ -1,4 +1,4 @@
-"""Tiles of a coadd that are warped from the exposures of visits, and averaged with inverse variances."""
+"""Tiles of a coadd that are warped from the exposures of visits and averaged with inverse-variance weights."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from romandask.kernels.coadding.background import as_float, subtract_background
 from romandask.kernels.coadding.coadd_psf import warped_psf
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.coadding.warp import Means
-from romandask.kernels.detectors.simple_detector import SATURATED, noise_realisation, usable
-from romandask.model.seeds import realisation_key, rng
+from romandask.kernels.detectors.simple_detector import SATURATED, usable
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.model.tiles import Tile
 from romandask.products.memory import release_free_memory
+from romandask.stages.coadds.exposure_noise import noise_realisations
 from romandask.stages.coadds.input_psfs import jacobian, psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
 from romandask.stages.psf_images import OVERSAMPLING, psf_image
@@ -25,20 +25,20 @@ from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
 @dataclass(frozen=True)
 class WarpTile(TileMaker):
-    """Makes one tile and band of the exposures that touch it."""
+    """Makes a tile in one band from the exposures that touch it."""
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return image, weight, noise, nimages, dq and the PSF."""
-        table, instrument, here = self.exposures.table, self.instrument, self.unit(index)
-        target, shape = here.wcs, (self.pixels, self.pixels)
+        """Return image, weight, noise, nimages, dq and psf of a unit."""
+        table, instrument, unit = self.exposures.table, self.instrument, self.unit(index)
+        target, shape = unit.wcs, (self.pixels, self.pixels)
         sums, side = Means(shape, 1 + self.settings.noise), psf_side(instrument)
-        psf, used = np.zeros((side, side)), 0.0
-        for i in here.members.tolist():
+        psf, total_weight = np.zeros((side, side)), 0.0
+        for i in unit.members.tolist():
             exposure = exposure_of(table.iloc[i])
-            weight = self._add(sums, exposure, i, target, self.seed)
+            weight = self._add(sums, exposure, i, target)
             if weight:
-                psf += weight * _psf(instrument, exposure, target, here.tile)
-                used += weight
+                psf += weight * _psf(instrument, exposure, target, unit.tile)
+                total_weight += weight
         release_free_memory()
         scale = np.float32(instrument.coadd_scale**2)
         image, *noise = (plane * scale for plane in sums.means())
@@ -48,15 +48,32 @@ class WarpTile(TileMaker):
             "noise": np.stack(noise),
             "nimages": sums.count,
             "dq": sums.marks * np.uint8(SATURATED),
-            "psf": (psf / max(used, 1e-30)).astype(np.float32),
+            "psf": (psf / max(total_weight, 1e-30)).astype(np.float32),
         }
 
-    def _add(self, sums: Means, exposure: Exposure, index: int, target: WCS, seed: int) -> float:
-        """Add an exposure; return its weight in the whole tile: 1 / nJy2 of a pixel, times pixels."""
+    def _add(self, sums: Means, exposure: Exposure, index: int, target: WCS) -> float:
+        """Add an exposure to the sums, and return its weight summed over the pixels of the tile.
+
+        Parameters
+        ----------
+        sums : Means
+            Sums over the exposures of the tile.
+        exposure : Exposure
+            The exposure.
+        index : int
+            Row of the exposure in the pointings table.
+        target : WCS
+            WCS of the tile.
+
+        Returns
+        -------
+        float, 1/nJy^2
+            0 if the exposure does not touch the tile.
+        """
         instrument = self.instrument
         header, shape = instrument.header(exposure), (self.pixels, self.pixels)
         frame = WCS(header)
-        # the part of the tile that the exposure may cover, and of the exposure that the tile may
+        # the part of the tile that the exposure may cover, and the part of the exposure that the tile may cover
         on_tile = strips(target, shape, frame, instrument.shape)
         on_frame = strips(frame, instrument.shape, target, shape)
         if not on_tile or not on_frame:
@@ -65,29 +82,23 @@ class WarpTile(TileMaker):
         bad, saturated = ~usable(arrays["dq"]), (arrays["dq"] & SATURATED) > 0
         light = subtract_background(as_float(arrays.pop("image")), bad)
         rows = slice(on_frame[0].rows.start, on_frame[-1].rows.stop)
-        here = rows, on_frame[0].columns
+        part = rows, on_frame[0].columns
         to_njy = NJY_ZERO_POINT / instrument.bandpass(exposure.band).ab_photons() / exposure.exptime
-        density = to_njy / pixel_areas(header, instrument.shape, *here)
-        variance = instrument.background(exposure, header, *here) + np.float32(instrument.detector.read_noise**2)
-        identity = ("noise", instrument.name, exposure.visit, exposure.detector)
-        noise = (
-            noise_realisation(
-                variance,
-                instrument.shape[1],
-                *here,
-                lambda block, k=number: rng(seed, "coadds", *identity, *realisation_key(k), block),
-            )
-            for number in range(self.settings.noise)
-        )
-        planes = np.stack([light[here] * density, *(plane * density for plane in noise)])
+        density = to_njy / pixel_areas(header, instrument.shape, *part)
+        variance = instrument.background(exposure, header, *part) + np.float32(instrument.detector.read_noise**2)
+        noise = noise_realisations(self.settings.noise, variance, instrument, exposure, part, self.seed)
+        planes = np.stack([light[part] * density, *(plane * density for plane in noise)])
         weight = 1 / float(np.mean(variance * density**2) * instrument.coadd_scale**4)
         onto = pixel_map(target, frame, slice(on_tile[0].rows.start, on_tile[-1].rows.stop), on_tile[0].columns)
-        corner = here[0].start, here[1].start
-        return weight * sums.add(planes, bad[here], saturated[here], weight, onto, corner)
+        corner = part[0].start, part[1].start
+        return weight * sums.add(planes, bad[part], saturated[part], weight, onto, corner)
 
 
 def _psf(instrument: Instrument, exposure: Exposure, target: WCS, tile: Tile) -> np.ndarray:
-    """Return a unit star of flat f_nu (side, side), as an exposure has it in the middle of a tile, or next to it."""
+    """Return the image on a tile of a star of unit flux and flat f_nu in an exposure, shape (side, side).
+
+    The PSF is that at the centre of the tile, or at the nearest position on the detector.
+    """
     source = WCS(instrument.header(exposure))
     ny, nx = instrument.shape
     x, y = np.clip(np.array(source.all_world2pix(tile.ra, tile.dec, 0, quiet=True), float), 0, [nx - 1, ny - 1])

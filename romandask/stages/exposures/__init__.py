@@ -1,1 +1,1 @@
-"""Exposures: rendering what a detector sees in one visit, and the product of all of them."""
+"""Exposures of single detectors in single visits: rendering, readout and their product."""

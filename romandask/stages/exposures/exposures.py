@@ -1,12 +1,14 @@
-"""Exposures: for each detector of each visit the observed image, the noiseless true image and the dq plane.
+"""Exposures: the observed image, the noiseless image and the dq plane of each detector in each visit.
 
-With the full model of a detector also the raw data numbers, of which the image is the calibration, and its variance.
+With the full detector model there are also the raw image in data numbers, which is calibrated to give the observed
+image, and the variance of the observed image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,59 +27,61 @@ from romandask.products.units import LazyUnits, Unit
 from romandask.stages.exposures.render import RenderExposure, cone, stage_of
 from romandask.stages.pointings import corners_of
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
-from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
+from romandask.stages.truth.catalogs import truth_of
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.arrays import Variable
 from romandask.storage.store import Store
 
 LAYERS = {
     "background": ("float32", "electron", "expected electrons that do not come from objects"),
-    "weight": ("float32", "1/electron2", "inverse variance of an empty pixel; 0 where dq forbids it"),
-    "psf": ("float32", "1/pixel", "unit star, flat f_nu, at the object's place, centred on pixel size // 2"),
+    "weight": ("float32", "1/electron2", "inverse variance of an empty pixel; 0 where dq makes the pixel unusable"),
+    "psf": ("float32", "1/pixel", "unit star, flat f_nu, at the position of the object, centred on pixel size // 2"),
 }
-"""Layers that cutouts of exposures have beside the stored arrays: dtype, unit, description."""
+"""Dtype, unit and description of the layers of cutouts that are not stored, by name."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Exposures(ImageSet):
-    """The exposures of one instrument: lazy images (exposure, y, x), and what makes them."""
+    """The exposures of one instrument: lazy images with the dims (exposure, y, x), and the object that renders them."""
 
     renderer: RenderExposure
+    """Makes the units of the product."""
 
     @property
     def table(self) -> pd.DataFrame:
-        """The pointings, one row an exposure."""
+        """Pointings table, one row per exposure."""
         return self.renderer.table
 
     @property
     def instrument(self) -> Instrument:
-        """The instrument."""
+        """Instrument of the exposures."""
         return self.renderer.instrument
 
     @property
     def footprints(self) -> np.ndarray:
-        """(n, 4, 2) corners of the exposures, degrees."""
+        """Corners of the exposures, shape (n, 4, 2), degrees."""
         return corners_of(self.table)
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """(ny, nx) of an exposure."""
+        """Rows and columns of an exposure."""
         return self.instrument.shape
 
     @property
     def unit_bands(self) -> np.ndarray:
-        """(n,) band of each exposure."""
+        """Band of each exposure, shape (n,)."""
         return self.table["band"].to_numpy(object)
 
     @property
     def extra_layers(self) -> dict[str, tuple[str, str, str]]:
-        """Layers of cutouts beside the stored arrays: dtype, unit, description."""
+        """Dtype, unit and description of the layers of cutouts that are not stored, by name."""
         return LAYERS
 
     def exposure(self, index: int) -> Exposure:
         """Return one exposure."""
         return exposure_of(self.table.iloc[index])
 
-    def header(self, index: int) -> dict:
+    def header(self, index: int) -> dict[str, Any]:
         """Return the FITS header of the WCS of an exposure."""
         return self.instrument.header(self.exposure(index))
 
@@ -88,17 +92,19 @@ class Exposures(ImageSet):
         window: tuple[slice, slice],
         arrays: dict[str, np.ndarray],
     ) -> dict[str, np.ndarray]:
-        """Return the layers `background` and `weight` of a window of an exposure, where they are wanted.
+        """Return the layers `background` and `weight` of a window of an exposure, if they are requested.
 
         Parameters
         ----------
         index : int
-            Of the exposure.
+            Index of the exposure.
         wanted : sequence of str
+            Names of the requested layers.
         window : (slice, slice)
-            Rows and columns.
+            Rows and columns of the window.
         arrays : dict of str to ndarray
-            Stored arrays of the window; `weight` needs `dq`, and `image` and `variance` where there is a variance.
+            Stored arrays of the window. `weight` needs `dq`, and `image` and `variance` if the exposures have a
+            variance.
         """
         if not {"background", "weight"} & set(wanted):
             return {}
@@ -109,15 +115,34 @@ class Exposures(ImageSet):
         return {"background": background, "weight": np.where(usable(arrays["dq"]), 1 / variance, np.float32(0))}
 
     def make_psfs(self, index: int, positions: np.ndarray, size: int) -> np.ndarray:
-        """Return the PSF (n, size, size) of a star of flat f_nu at positions (n, 2), pixels, of an exposure."""
+        """Return images of stars of unit flux and flat f_nu at positions on an exposure.
+
+        Parameters
+        ----------
+        index : int
+            Index of the exposure.
+        positions : ndarray, shape (n, 2), pixels
+            x and y on the detector.
+        size : int, pixels
+            Side of an image.
+
+        Returns
+        -------
+        ndarray, shape (n, size, size), float32
+            Each star is centred on pixel size // 2.
+        """
         exposure, instrument = self.exposure(index), self.instrument
         psf, shares = instrument.psf(exposure), flat_shares(instrument.bandpass(exposure.band))
         return np.stack([fine_image(psf, shares, x, y, size, 1) for x, y in positions]).astype(np.float32)
 
     def effects(self, index: int) -> dict[str, np.ndarray]:
-        """Return what each effect of the detector does to an exposure: images around its brightest object, electrons.
+        """Return the change that each detector effect makes to an exposure.
 
-        Empty where the detector has no effects that can be taken apart.
+        Returns
+        -------
+        dict of str to ndarray, electrons
+            One image around the brightest object for each effect, by name; empty if the detector model does not
+            separate its effects.
         """
         renderer = self.renderer
         truth = self.load(index, ("truth",))["truth"]
@@ -125,7 +150,7 @@ class Exposures(ImageSet):
 
 
 def flat_shares(bandpass: Bandpass) -> np.ndarray:
-    """Return the share of the photons of a source of flat f_nu that goes to each PSF node of a band."""
+    """Return the fraction of the photons of a source of flat f_nu at each PSF node of a band, shape (nodes,)."""
     photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
     return photons / photons.sum()
 
@@ -139,21 +164,24 @@ def exposures(
     calibration: ImageProduct | None = None,
     store: Store | None = None,
 ) -> Exposures:
-    """Return the lazy exposures of a pointings table: dims (exposure, y, x).
+    """Return the lazy exposures of a pointings table, with the dims (exposure, y, x).
 
     Parameters
     ----------
     table : DataFrame
-        Pointings (schema: catalogs/pointings.yaml).
+        Pointings table (schema: catalogs/pointings.yaml).
     truth : TruthCatalogs
+        Galaxies and stars to draw.
     instrument : Instrument
+        Instrument of the exposures.
     render : RenderSettings
+        The `render` section of the pipeline.
     seed : int
-        Of the survey.
-    calibration : ImageProduct or None
-        Of the detectors, for the full model of a detector; None for the simple one.
-    store : Store or None
-        Where the tables that earlier exposures left may be; None to work them out.
+        Seed of the survey.
+    calibration : ImageProduct, optional
+        Calibrations of the detectors, for the full detector model; None for the simple one.
+    store : Store, optional
+        Store that the tables of trapped charge of earlier exposures are read from; None to compute them.
     """
     ny, nx = instrument.shape
     readout = instrument.readout(seed, calibration)
@@ -166,54 +194,61 @@ def exposures(
         "psf": instrument.psf_settings,
         "readout": readout.settings,
     }
-    every = exposures_of(table)
-    names = [exposure.name for exposure in every]
+    all_exposures = exposures_of(table)
+    names = [exposure.name for exposure in all_exposures]
     corners = corners_of(table)
 
     def unit(row: int) -> Unit:
         inputs = truth.inputs(*cone(corners[row]))
         earlier = readout.earlier(table, row).tolist()
-        # what an exposure leaves depends on its own light alone, so on the truth around it
-        lights = [source for k in earlier for source in truth.inputs(*cone(corners[k]))]
+        # the charge that an earlier exposure leaves depends only on its own light, and so on the truth near it
+        earlier_inputs = [source for k in earlier for source in truth.inputs(*cone(corners[k]))]
+        exposure = all_exposures[row]
         return Unit(
             name=names[row],
-            settings={**common, "row": row, **vars(every[row]), "earlier": [vars(every[k]) for k in earlier]},
-            inputs=tuple(dict.fromkeys([*inputs, *lights, *readout.inputs(every[row])])),
+            settings={**common, "row": row, **vars(exposure), "earlier": [vars(all_exposures[k]) for k in earlier]},
+            inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure)])),
             prerequisites=tuple(names[k] for k in earlier),
-            # PSFs are those of a detector and band
-            affinity=f"{every[row].band}-{every[row].detector}",
+            # exposures of the same detector and band share the PSFs in a worker's cache
+            affinity=f"{exposure.band}-{exposure.detector}",
         )
 
     axes = ("exposure",)
 
     def coordinates() -> Coordinates:
         columns = ("visit", "detector", "band", "mjd", "exptime", "ra", "dec", "pa")
-        headers = [header_text(instrument.header(exposure)) for exposure in every]
-        text = {"description": "FITS header of the WCS, 80-column cards"}
+        headers = [header_text(instrument.header(exposure)) for exposure in all_exposures]
+        attributes = {"description": "FITS header of the WCS, 80-column cards"}
         return {
             **{name: (axes, table[name].to_numpy(), {}) for name in columns},
             "exposure": (axes, np.array(names, object), {}),
-            "header": (axes, np.array(headers, object), text),
+            "header": (axes, np.array(headers, object), attributes),
         }
 
     renderer = RenderExposure(
         table=table, truth=truth, instrument=instrument, render=render, seed=seed, readout=readout, store=store
     )
     image, *others = readout.variables
-    noiseless = {"units": "electron", "long_name": "noiseless image of the objects"}
+    noiseless = Variable(
+        name="truth",
+        dtype="float32",
+        shape=instrument.shape,
+        axes=("y", "x"),
+        attributes={"units": "electron", "long_name": "noiseless image of the objects"},
+    )
     product = ImageProduct(
         stage=stage_of(instrument),
         units=LazyUnits(tuple(names), unit),
         make=renderer,
-        variables=(image, Variable("truth", "float32", instrument.shape, ("y", "x"), noiseless), *others),
+        variables=(image, noiseless, *others),
         axes=axes,
         lengths=(len(table),),
         coordinates=coordinates,
         attributes={"survey": instrument.name},
-        # image, truth, dq, background and working copies; the wide PSF of one node, as it is sampled or as it is
-        # drawn; the objects, and the PSFs of a detector and band, the last and the new
+        # image, truth, dq, background and working copies; the wide PSF of one node, while it is sampled or drawn; the
+        # objects, and the PSFs of two detectors or bands: the previous and the present ones
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
-        # sky, noise and storage, every effect and its calibration; then objects
+        # sky, noise, detector effects and storage, then objects
         seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15),
         tables=readout.tables,
     )
@@ -223,27 +258,38 @@ def exposures(
 def empty_variance(
     arrays: dict[str, np.ndarray], background: np.ndarray, detector: Detector, window: tuple[slice, ...] = ()
 ) -> np.ndarray:
-    """Return the variance (float32, electrons^2) that a window of an exposure would have without objects.
+    """Return the variance that a window of an exposure would have without objects.
 
     Parameters
     ----------
-    arrays : whole arrays of the exposure; of the full model of a detector `image` and `variance` are used
-    background : expected electrons of the window
+    arrays : dict of str to ndarray
+        Arrays of the exposure. With the full detector model, `image` and `variance` are used.
+    background : ndarray, electrons
+        Expected electrons of the window that do not come from objects.
+    detector : Detector
+        Constants of the detector.
+    window : tuple of slice
+        Window of the arrays; by default all of them.
+
+    Returns
+    -------
+    ndarray, float32, electrons^2
+        Variance; at least that of the read noise.
     """
     floor = np.float32(detector.read_noise**2)
     if "variance" not in arrays:
         return background + floor
-    # the image's own electrons are in its variance
+    # the variance contains the Poisson noise of the electrons of the objects
     return np.maximum(arrays["variance"][window] - (arrays["image"][window] - background), floor)
 
 
-def header_text(header: dict) -> str:
-    """Return the cards of a header as one text, exact to the last digit of every value."""
+def header_text(header: dict[str, Any]) -> str:
+    """Return the cards of a FITS header as text, which keeps every digit of the values."""
     return fits.Header([(key, value) for key, value in header.items()]).tostring(endcard=True)
 
 
 def wcs_of(text: str) -> WCS:
-    """Return the WCS of a header text."""
+    """Return the WCS of a FITS header given as text (see `header_text`)."""
     return WCS(fits.Header.fromstring(text))
 
 
@@ -263,7 +309,7 @@ def build_exposures(context: SurveyContext, survey: str) -> Exposures:
 
 
 def has_exposures(context: SurveyContext, survey: str) -> bool:
-    """Return whether an instrument's coadds are made from exposures, not drawn from its cadence."""
+    """Return whether the coadds of an instrument are made from exposures, and not drawn directly from its cadence."""
     return context.instruments[survey].coadd != "draw"
 
 
@@ -275,8 +321,8 @@ EXPOSURES = Stage(
     reads=("truth/galaxies", "truth/stars", "calibration"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="visit and detector",
-    summary="Images rendered in Fourier space with the chromatic PSF of each place on the detector: the noiseless "
-    "image of the objects beside the observed one; a simple detector, or every effect of the SCAs or CCDs.",
+    summary="Observed and noiseless images, rendered in Fourier space with the chromatic PSF at each position and read "
+    "out with a simple detector or with all effects of the SCAs or CCDs.",
     shrink_with="lower render.largest",
     tables={"trapped": "exposures/<survey>_trapped/"},
 )

@@ -1,4 +1,4 @@
-"""Rendering one exposure: the scene that a detector looks at, drawn without noise, and read out."""
+"""Rendering of one exposure: the scene of a detector is drawn without noise, then read out."""
 
 from __future__ import annotations
 
@@ -21,45 +21,54 @@ from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
 from romandask.products.tables import to_frame
 from romandask.stages.pointings import corners_of
-from romandask.stages.truth.catalogs import TruthCatalogs
+from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.manifest import read_record
 from romandask.storage.store import Store, read_parquet
 
 REACH = 30.0
-"""Arcsec outside a detector within which objects may shine on it."""
+"""Distance from a detector within which galaxies are taken into account, arcsec."""
 STAR_REACH = 115.0
-"""The same for bright stars, whose diffraction spikes are long."""
+"""As REACH, for stars; it is larger because the diffraction spikes of bright stars are long."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What an exposure looks at, ready to be drawn: the light before the detector."""
+    """The scene and the background of one exposure, before the detector."""
 
     exposure: Exposure
     instrument: Instrument
     render: RenderSettings
-    header: dict
+    header: dict[str, Any]
+    """FITS header with the WCS."""
     truth: Truth
+    """Rows of the truth catalogs near the detector."""
     drawable: Drawable
+    """The objects that can be drawn."""
     background: np.ndarray
-    """(ny, nx) expected electrons that do not come from objects."""
+    """Expected electrons that do not come from objects, shape (ny, nx)."""
     faintest: float
-    """Surface brightness, electrons a pixel, below which stamps may end."""
+    """Largest surface brightness at the edge of a stamp, electrons/pixel."""
     stamps: Stamps
-    """Of the drawable objects."""
+    """Stamps of the objects of the scene."""
 
     @property
     def scene(self) -> Scene:
-        """The drawable objects, in pixels and electrons."""
+        """The n drawable objects, in pixels and electrons."""
         return self.drawable.scene
 
     @property
     def stamp_sizes(self) -> np.ndarray:
-        """(n,) pixels along a side of the stamp of each object; 0 for one that is not drawn."""
+        """Side of the stamp of each object, shape (n,), pixels; 0 for an object that is not drawn."""
         return self.stamps.size
 
     def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
-        """Return the noiseless image (ny, nx), electrons, of the objects, or of those where `chosen` (n,) is true."""
+        """Return the noiseless image of the objects, shape (ny, nx), electrons.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (n,), optional
+            True for the objects to draw; by default all are drawn.
+        """
         instrument, exposure, stamps = self.instrument, self.exposure, self.stamps
         if chosen is not None:
             stamps = replace(stamps, size=np.where(chosen, stamps.size, 0))
@@ -70,7 +79,7 @@ class View:
         return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
 
     def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
-        """Return the cell of a position and GalSim's PSFs there, one a node."""
+        """Return the cell of a position on the detector, and GalSim's PSFs there, one per PSF node."""
         return Profiles(self.instrument, self.exposure)(x, y)
 
 
@@ -79,17 +88,19 @@ class RenderExposure:
     """Makes the arrays of one exposure."""
 
     table: pd.DataFrame
-    """The pointings."""
+    """Pointings table (schema: catalogs/pointings.yaml); its rows are the units."""
     truth: TruthCatalogs
     instrument: Instrument
     render: RenderSettings
     seed: int
+    """Seed of the survey."""
     readout: Readout
+    """The detector model."""
     store: Store | None = None
-    """Where the tables that earlier exposures left may be."""
+    """Store that the tables of earlier exposures are read from; without one they are computed."""
 
     def view(self, index: int) -> View:
-        """Return what the exposure at a row of the pointings table looks at."""
+        """Return the scene and the background of the exposure in a row of the pointings table."""
         exposure, instrument = exposure_of(self.table.iloc[index]), self.instrument
         header = instrument.header(exposure)
         truth = self.truth.near(*cone(corners_of(self.table.iloc[[index]])[0]))
@@ -124,34 +135,34 @@ class RenderExposure:
         )
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Return the arrays of the exposure at a row of the pointings table, by name, and its tables."""
+        """Return the arrays and tables, by name, of the exposure in a row of the pointings table."""
         return self.readout(self.view(index), self.left(index))
 
     def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
-        """Return the earlier exposures that leave charge in an exposure, each with the table of what it left."""
+        """Return the earlier exposures whose trapped charge affects an exposure, each with its table of that charge."""
         rows = self.readout.earlier(self.table, index).tolist()
         return [(exposure_of(self.table.iloc[row]), self.left_by(row)) for row in rows]
 
     def left_by(self, index: int) -> pd.DataFrame:
-        """Return what an exposure left: read where it is stored, worked out where not."""
+        """Return the table of trapped charge that an exposure leaves: read if it is stored, otherwise computed."""
         exposure, stage = exposure_of(self.table.iloc[index]), stage_of(self.instrument)
         if self.store is not None and read_record(self.store, stage, exposure.name):
-            (table,) = self.readout.tables
-            return to_frame(read_parquet(table_beside(self.store, stage, table, exposure.name)))
+            (table_name,) = self.readout.tables
+            return to_frame(read_parquet(table_beside(self.store, stage, table_name, exposure.name)))
         return self.readout.leave(self.view(index))
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """GalSim's PSFs of an exposure, one a node, on a coarse grid of cells: what the GalSim engine draws with."""
+    """GalSim's PSFs of an exposure on a coarse grid of cells, for the GalSim engine."""
 
     instrument: Instrument
     exposure: Exposure
     cells: int = 4
-    """Along each side of the detector; an object has the PSF of the middle of its cell."""
+    """Number of cells along each side of the detector. An object is drawn with the PSF at the centre of its cell."""
 
     def __call__(self, x: float, y: float) -> tuple[tuple[int, int], list[galsim.GSObject]]:
-        """Return the cell of a position and the PSFs there."""
+        """Return the cell of a position on the detector, pixels, and the PSFs of the cell, one per PSF node."""
         i, j = (
             int(np.clip(value * self.cells // side, 0, self.cells - 1))
             for value, side in zip((x, y), self.instrument.shape[::-1], strict=True)
@@ -167,12 +178,25 @@ def _cell_profiles(profiles: Profiles, i: int, j: int) -> list[galsim.GSObject]:
 
 
 def stage_of(instrument: Instrument) -> str:
-    """Return the name of the product of an instrument's exposures."""
+    """Return the name of the product with the exposures of an instrument."""
     return f"exposures/{instrument.name}"
 
 
 def cone(corners: np.ndarray) -> tuple[float, float, float, float]:
-    """Return centre and radii (degrees) of the cones around a footprint from which galaxies and stars shine on it."""
+    """Return the cones around a footprint that contain all galaxies and stars with light on it.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (4, 2), degrees
+        Corners of the footprint.
+
+    Returns
+    -------
+    ra, dec : float, degrees
+        Centre of both cones.
+    galaxy_radius, star_radius : float, degrees
+        Radii of the cones.
+    """
     vectors = unit_vectors(corners[:, 0], corners[:, 1])
     centre = vectors.sum(axis=0)
     centre /= np.linalg.norm(centre)

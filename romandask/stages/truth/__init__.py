@@ -1,1 +1,1 @@
-"""The true universe: generated, or ingested from source catalogs."""
+"""Truth catalogs: galaxies and stars that are generated, or ingested from source catalogs."""

@@ -1,10 +1,10 @@
-"""Source catalogs on their way in: batches of rows by their place on the sky, then galaxies, stars and quarantine."""
+"""Ingestion of source catalogs: batches of rows, then the galaxies, stars and quarantined rows of HEALPix cells."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,38 +26,50 @@ from romandask.products.units import Unit
 from romandask.storage.paths import AnyPath, access_errors_explained, resolve_below
 
 SPECTRA = ("bulge_sed", "disk_sed", "knots_sed", "sed")
+"""Columns with the names of spectra."""
 _BATCH_BYTES = 600 << 20
+"""Peak memory of reading one batch, bytes."""
 
 
 def open_sources(settings: TruthSettings, data: AnyPath) -> tuple[Source, ...]:
-    """Return the source catalogs that the settings name, checked.
+    """Return the source catalogs that the settings name, after checking them.
+
+    Parameters
+    ----------
+    settings : TruthSettings
+        The `truth` section of the pipeline.
+    data : path
+        Folder that paths in the settings are relative to.
 
     Raises
     ------
     UserError
-        Naming the file, column or key that is missing or wrong.
+        If a file, column or key is missing or wrong; the message names it.
     """
-    opened = {"skycatalogs": skycatalogs.open_source, "instance_catalog": instance_catalog.open_source}
-    if settings.source in opened:
-        place = resolve_below(data, str(settings.path))
-        with access_errors_explained(place):
-            return (opened[settings.source](place),)
-    found = []
-    for kind, each in (("galaxy", settings.galaxy_table), ("star", settings.star_table)):
-        if each is not None:
-            place = resolve_below(data, each.path)
-            with access_errors_explained(place):
-                found.append(table.open_source(place, dict(each.columns), kind))
-    return tuple(found)
+    openers: dict[str, Callable[[AnyPath], Source]] = {
+        "skycatalogs": skycatalogs.open_source,
+        "instance_catalog": instance_catalog.open_source,
+    }
+    if settings.source in openers:
+        path = resolve_below(data, str(settings.path))
+        with access_errors_explained(path):
+            return (openers[settings.source](path),)
+    sources = []
+    for kind, table_settings in (("galaxy", settings.galaxy_table), ("star", settings.star_table)):
+        if table_settings is not None:
+            path = resolve_below(data, table_settings.path)
+            with access_errors_explained(path):
+                sources.append(table.open_source(path, dict(table_settings.columns), kind))
+    return tuple(sources)
 
 
 def ingested_rows(sources: tuple[Source, ...]) -> TableProduct:
-    """Return the rows of source catalogs in their normal form (schema: catalogs/ingested.yaml), a unit a batch."""
+    """Return the lazy normal form of source catalogs (schema: catalogs/ingested.yaml), with one unit per batch."""
     pairs = tuple((number, batch) for number, source in enumerate(sources) for batch in source.batches())
     states = [source.state() for source in sources]
     names = [f"{number}-{batch.name}" if len(sources) > 1 else batch.name for number, batch in pairs]
     units = tuple(
-        Unit(name, {"source": states[number], "start": batch.start, "stop": batch.stop})
+        Unit(name=name, settings={"source": states[number], "start": batch.start, "stop": batch.stop})
         for name, (number, batch) in zip(names, pairs, strict=True)
     )
     return TableProduct(
@@ -71,42 +83,52 @@ def ingested_rows(sources: tuple[Source, ...]) -> TableProduct:
 
 @dataclass(frozen=True, eq=False)
 class _ReadBatch:
+    """Reads the rows of a batch, sorted by HEALPix cell; rows without a valid position come first, with cell -1."""
+
     sources: tuple[Source, ...]
     pairs: tuple[tuple[int, Batch], ...]
+    """Index of the source, and the batch, of each unit."""
 
     def __call__(self, index: int) -> pd.DataFrame:
         number, batch = self.pairs[index]
         frame = self.sources[number].read(batch)
-        placed = np.isfinite(frame["ra"]) & np.isfinite(frame["dec"]) & (frame["dec"].abs() <= 90)
-        located = with_spatial_index(frame[placed])
-        return pd.concat([frame[~placed].assign(_healpix_29=np.int64(-1)), located], ignore_index=True)
+        valid = np.isfinite(frame["ra"]) & np.isfinite(frame["dec"]) & (frame["dec"].abs() <= 90)
+        indexed = with_spatial_index(frame[valid])
+        return pd.concat([frame[~valid].assign(_healpix_29=np.int64(-1)), indexed], ignore_index=True)
+
+
+def _sources_of(rows: TableProduct) -> tuple[Source, ...]:
+    """Return the source catalogs of ingested rows."""
+    assert isinstance(rows.make, _ReadBatch)
+    return rows.make.sources
 
 
 def edges_of(rows: TableProduct) -> tuple[float, ...]:
-    """Return the edges, nm, of the top-hat bins of ingested rows; empty where there are none."""
-    source: _ReadBatch = rows.make  # type: ignore[assignment]
-    return next((each.edges for each in source.sources if each.edges), ())
+    """Return the rest-frame edges, nm, of the top-hat bins of ingested rows; empty if no row has a top-hat spectrum."""
+    return next((source.edges for source in _sources_of(rows) if source.edges), ())
 
 
 def source_rows(rows: TableProduct) -> int:
     """Return the number of rows of the source catalogs."""
-    source: _ReadBatch = rows.make  # type: ignore[assignment]
-    counts = [each.count() for each in source.sources]
+    counts = [source.count() for source in _sources_of(rows)]
     return sum(count for count in counts if count is not None)
 
 
 @dataclass(frozen=True)
 class RowsSummary:
-    """What a pass over all ingested rows tells."""
+    """Cells and spectra of all good ingested rows."""
 
     cells: np.ndarray
-    """HEALPix cells with rows."""
+    """HEALPix cells with rows, sorted."""
     spectra: tuple[str, ...]
     """Names of spectra, sorted."""
 
 
 def scan_rows(rows: TableProduct, order: int) -> RowsSummary:
-    """Return the cells and the names of spectra of all good ingested rows, a batch at a time."""
+    """Return the HEALPix cells, of the given order, and the spectra of all good ingested rows.
+
+    Batches are read one at a time.
+    """
     cells: set[int] = set()
     names: set[str] = set()
     for index in range(len(rows.units)):
@@ -118,32 +140,41 @@ def scan_rows(rows: TableProduct, order: int) -> RowsSummary:
     return RowsSummary(np.array(sorted(cells), np.int64), tuple(sorted(names - {""})))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Assemble:
-    """Makes the truth catalogs' partitions of ingested rows."""
+    """Makes the partitions of a truth catalog from ingested rows."""
 
     settings: TruthSettings
     region: Region
     bandpasses: dict[str, Bandpass]
+    """Bandpasses of the survey, by band."""
     rows: TableProduct
+    """Ingested rows, from `ingested_rows`."""
     edges: tuple[float, ...]
+    """Rest-frame edges of the bins of top-hat spectra, nm."""
     library: SpectrumLibrary
+    """Spectra that rows refer to by name."""
     unusable: dict[str, str]
-    """By name of a spectrum, why it cannot be used."""
+    """Reason why a spectrum cannot be used, by its name."""
     cells: np.ndarray
+    """HEALPix cells of the partitions, nested scheme, of order `settings.order`."""
     kind: str
+    """Kind of the objects of the catalog: "galaxy" or "star"."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the rows of one cell."""
+        """Return the rows of one partition (schema: catalogs/galaxies.yaml or catalogs/stars.yaml)."""
         merged = self.merged(index)
         good = merged[(merged["reason"] == "") & (merged["kind"] == self.kind)]
         inside = self.region.contains(good["ra"], good["dec"], self.settings.margin)
         good = with_spatial_index(good[inside])
-        # components merge to the position of the first: all lie within the cell of the rows that were read
+        # a merged galaxy has the position of its first component, so it lies in the cell as all rows do
         return self._galaxies(good) if self.kind == "galaxy" else self._stars(good)
 
     def merged(self, index: int) -> pd.DataFrame:
-        """Return the cell's rows, components made galaxies, with reasons."""
+        """Return the rows of a cell with their reasons, after the components of each galaxy have been merged.
+
+        Rows that are quarantined already as single rows are left out.
+        """
         shift = 2 * (29 - self.settings.order)
         cell = int(self.cells[index])
         parts = [_selected(self.rows, unit, cell << shift, (cell + 1) << shift) for unit in range(len(self.rows.units))]
@@ -155,18 +186,18 @@ class Assemble:
         return merge_components(frame[frame["reason"] == ""])
 
     def reasons(self, frame: pd.DataFrame) -> np.ndarray:
-        """Return why rows cannot be used, those of their spectra included."""
+        """Return the reason why each row cannot be used, or "" for a good row, including faults of its spectra."""
         reason = frame["reason"].to_numpy(object).copy()
         blue = min(bandpass.wave[0] for bandpass in self.bandpasses.values())
         red = max(bandpass.wave[-1] for bandpass in self.bandpasses.values())
-        place = {name: row for row, name in enumerate(self.library.names)}
+        library_index = self._library_index()
         stretch = 1 + frame["redshift"].fillna(0).to_numpy()
         for column in SPECTRA:
             names = frame[column]
             if column != "sed":
                 names = names.where(np.isfinite(frame[column.replace("_sed", "_magnorm")]), "")
             bad = names.map(lambda name: self.unusable.get(name, "")).to_numpy(object)
-            index = names.map(place).fillna(-1).to_numpy(int)
+            index = names.map(library_index).fillna(-1).to_numpy(int)
             known = index >= 0
             short = np.zeros(len(frame), bool)
             low, high = self.library.limits[index[known]].T if known.any() else (0, 0)
@@ -175,25 +206,31 @@ class Assemble:
             reason = np.where(reason == "", bad, reason)
         return reason
 
+    def _library_index(self) -> dict[str, int]:
+        """Return the index of each spectrum of the library, by its name."""
+        return {name: index for index, name in enumerate(self.library.names)}
+
     def _galaxies(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return good galaxies as rows of the truth catalog."""
         if not len(frame):
             return schema("galaxies", tuple(self.bandpasses)).empty_table().to_pandas()
-        place = {name: row for row, name in enumerate(self.library.names)}
-        sed = {f"{c}_sed": frame[f"{c}_sed"].map(place).fillna(-1).to_numpy(int) for c in COMPONENTS}
+        library_index = self._library_index()
+        sed = {f"{c}_sed": frame[f"{c}_sed"].map(library_index).fillna(-1).to_numpy(int) for c in COMPONENTS}
         lengths = frame["sed_val_disk"].map(len).to_numpy()
         red = max(bandpass.wave[-1] for bandpass in self.bandpasses.values()) / (1 + frame["redshift"].to_numpy())
         extended = (lengths > 0) & (red > (self.edges[-1] if self.edges else np.inf))
         frame = frame.rename(columns={"id": "galaxy_id"}).assign(**sed, sed_extended=extended)
         # a component without light may have no size
-        for column in (name for name in frame if name.startswith("size_")):
+        for column in [name for name in frame.columns if name.startswith("size_")]:
             frame[column] = frame[column].fillna(0.0)
-        photons = 0.0
+        photons: np.ndarray | float = 0.0
         milky_way = Dust(frame["MW_av"].to_numpy(float), frame["MW_rv"].to_numpy(float))
         for component in COMPONENTS:
-            own = "bulge" if component == "bulge" else "disk"
+            # knots have the dust of the disk
+            dust = "bulge" if component == "bulge" else "disk"
             magnorm = frame[f"{component}_magnorm"].to_numpy(float)
             lit = np.isfinite(magnorm)
-            av, rv = (np.where(lit, frame[f"{own}_{name}"].to_numpy(float), 0.0) for name in ("av", "rv"))
+            av, rv = (np.where(lit, frame[f"{dust}_{name}"].to_numpy(float), 0.0) for name in ("av", "rv"))
             photons = photons + band_photons(
                 magnorm,
                 component_spectra(frame, component, self.library, self.edges),
@@ -205,21 +242,28 @@ class Assemble:
             )
         frame = frame.assign(
             **{
-                f"{own}_{name}": frame[f"{own}_{name}"].fillna(value)
-                for own in ("bulge", "disk")
+                f"{dust}_{name}": frame[f"{dust}_{name}"].fillna(value)
+                for dust in ("bulge", "disk")
                 for name, value in (("av", 0.0), ("rv", 3.1))
             }
         )
         return self._with_fluxes(frame, photons * magnification(frame)[:, None])
 
     def _stars(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return good stars as rows of the truth catalog.
+
+        Raises
+        ------
+        UserError
+            If a star has its brightness in a band that the survey does not have.
+        """
         if not len(frame):
             return schema("stars", tuple(self.bandpasses)).empty_table().to_pandas()
-        place = {name: row for row, name in enumerate(self.library.names)}
-        spectra = LibrarySpectra(self.library, frame["sed"].map(place).to_numpy(int))
+        spectra = LibrarySpectra(self.library, frame["sed"].map(self._library_index()).to_numpy(int))
         milky_way = Dust(frame["MW_av"].to_numpy(float), frame["MW_rv"].to_numpy(float))
-        none = np.zeros(len(frame))
-        unit = band_photons(none, spectra, none, no_dust(len(frame)), milky_way, tuple(self.bandpasses.values()))
+        zeros = np.zeros(len(frame))
+        # photons of stars of magnorm 0
+        unit = band_photons(zeros, spectra, zeros, no_dust(len(frame)), milky_way, tuple(self.bandpasses.values()))
         magnorm = frame["magnorm"].to_numpy(float).copy()
         for k, (band, bandpass) in enumerate(self.bandpasses.items()):
             rows = np.isnan(magnorm) & (frame["ref_band"].to_numpy() == f"lsst_{band}")
@@ -235,6 +279,7 @@ class Assemble:
         return self._with_fluxes(frame, unit * 10 ** (-0.4 * magnorm)[None, :, None])
 
     def _with_fluxes(self, frame: pd.DataFrame, photons: np.ndarray) -> pd.DataFrame:
+        """Return rows with the flux columns of all bands; `photons` has the layout of `band_photons`."""
         columns: dict[str, np.ndarray] = {}
         for k, (band, bandpass) in enumerate(self.bandpasses.items()):
             columns |= flux_columns(band, njy(photons[:, :, k], bandpass))
@@ -243,13 +288,17 @@ class Assemble:
 
 @dataclass(frozen=True)
 class Quarantine:
-    """Makes the rows that were set aside: of each batch those that are bad by themselves, of each cell those that
-    are at odds with others."""
+    """Makes the quarantined rows.
+
+    The first units are the batches, with the rows that are bad in themselves; the others are the cells, with the rows
+    that contradict other rows.
+    """
 
     assemble: Assemble
+    """Finds the reasons."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the rows of a batch, or after all batches those of a cell."""
+        """Return the quarantined rows of a unit (schema: catalogs/quarantine.yaml)."""
         rows = self.assemble.rows
         if index < len(rows.units):
             frame = rows.select(index)
@@ -261,13 +310,13 @@ class Quarantine:
 
 
 def _selected(rows: TableProduct, unit: int, low: int, high: int) -> pd.DataFrame:
-    """Return a batch's rows between two HEALPix cells of order 29; a batch that is not stored is made once."""
+    """Return the rows of a batch with low <= _healpix_29 < high; a batch that is not stored is made and cached."""
     if rows.has(unit):
         return rows.select(unit, None, (low, high))
-    frame = _made(rows.make, unit)
+    frame = _cached_batch(rows.make, unit)
     return frame[(frame["_healpix_29"] >= low) & (frame["_healpix_29"] < high)]
 
 
 @lru_cache(maxsize=8)
-def _made(make: Any, unit: int) -> pd.DataFrame:
+def _cached_batch(make: Callable[[int], pd.DataFrame], unit: int) -> pd.DataFrame:
     return make(unit)

@@ -14,10 +14,9 @@ from romandask.kernels.rendering import draw as render
 from romandask.kernels.rendering.draw import Scene, plan_stamps, stamp_sizes
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, knot_offset
 from romandask.kernels.rendering.galsim_sampling import sample_model
-from romandask.kernels.rendering.scene import build_scene, magnification, pixel_positions, shape_matrices
+from romandask.kernels.rendering.scene import bind, build_scene, magnification, pixel_positions, shape_matrices
 from romandask.kernels.rendering.seeing import kolmogorov_transfer, radial_model
 from romandask.model.tiles import tangent_header
-from romandask.stages.truth.catalogs import bind
 
 SHARES = np.array([0.2, 0.5, 0.3])
 """Fractions of the light at the three nodes."""

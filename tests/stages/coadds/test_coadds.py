@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.coadding.stack import stack
@@ -20,7 +21,7 @@ from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.model.errors import UserError
 from romandask.model.tiles import tangent_header
 from romandask.stages.coadds.coadds import coadds
-from romandask.stages.coadds.drizzled import saturated_places
+from romandask.stages.coadds.drizzled import saturated_pixels
 from romandask.stages.coadds.pixfrac import CHOICES, TEST_SQUARE_PIXELS, advice, coverage
 from romandask.stages.exposures.exposures import wcs_of
 from romandask.stages.exposures.render import RenderExposure
@@ -36,6 +37,12 @@ class Counting(RenderExposure):
     def __call__(self, index):
         CALLS.append(index)
         return super().__call__(index)
+
+
+def exposures_of_rubin(small):
+    """The small exposures, taken for those of an instrument whose coadds are drawn from its cadence."""
+    rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
+    return replace(small.product, renderer=replace(small.product.renderer, instrument=rubin))
 
 
 def target_of(small, pixels=500):
@@ -83,7 +90,7 @@ def test_tiles_are_marked_where_exposures_are_saturated(small):
     marked = np.zeros(shape, np.uint8)
     for part in parts:
         onto = pixel_map(source, target, part.rows, part.columns)
-        marked.ravel()[saturated_places(dq, onto, shape)] = SATURATED
+        marked.ravel()[saturated_pixels(dq, onto, shape)] = SATURATED
     sums = Sums(shape, 1, 0.7)
     light = ((dq & SATURATED) > 0).astype(np.float32)
     sums.add(
@@ -188,7 +195,7 @@ def test_pixfrac_is_advised_from_the_weights_that_the_package_gives(small):
     good = [replace(one, empty=0.0, uneven=0.3 if one.pixfrac < 0.6 else 0.1) for one in found]
     assert advice(good) == 0.6
     with pytest.raises(UserError, match="no Roman"):
-        coverage(replace(product, make=None))
+        coverage(replace(product, maker=replace(product.maker, exposures=exposures_of_rubin(small))))
 
 
 def test_an_image_elsewhere_has_no_strips(small):

@@ -9,6 +9,7 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy.special import erf
 
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map
@@ -117,5 +118,7 @@ def test_places_and_bands_that_are_not_there_are_told(small):
         coadd_psf(product, 10.0, 10.0, "H158")
     with pytest.raises(UserError, match="none negative"):
         coadd_psf(product, ra, dec, "H158", spectrum=lambda wave: -wave)
-    with pytest.raises(UserError, match="drizzled coadds"):
-        coadd_psf(replace(product, make=None), ra, dec, "H158")
+    rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
+    exposures = replace(small.product, renderer=replace(small.product.renderer, instrument=rubin))
+    with pytest.raises(UserError, match="only for drizzled coadds"):
+        coadd_psf(replace(product, maker=replace(product.maker, exposures=exposures)), ra, dec, "i")

@@ -97,7 +97,13 @@ LONG = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take long: at the end, one process would run them alone."""
+    """Begin with the files that take long: at the end, one process would run them alone.
+
+    A test of the stored tiny survey is slow: the first makes it.
+    """
+    for item in items:
+        if "tiny_store" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
     places = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
 

@@ -16,15 +16,9 @@ from romandask.products.hats import rows_around
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.friends_of_friends import (
-    CODES,
-    Matches,
-    chance_of,
-    has_joint_analysis,
-    joint,
-    length_name,
-    matches_of,
-)
+from romandask.stages.analysis.blend_pair import has_joint_analysis, joint
+from romandask.stages.analysis.friends_of_friends import Matches, chance_of, length_name, matches_of
+from romandask.stages.analysis.partitions import CODES
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.stages.truth.catalogs import truth_of
 

@@ -14,8 +14,9 @@ from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.blend_statistics import PairSample, Samples, matrix, statistics
+from romandask.stages.analysis.blend_statistics import matrix, statistics
 from romandask.stages.analysis.friends_of_friends import SHIFT, matches
+from romandask.stages.analysis.group_members import PairSample, Samples
 from romandask.stages.analysis.samples import limits, samples
 from romandask.storage.store import Store
 

@@ -18,15 +18,8 @@ from romandask.model.sky import Region
 from romandask.products.hats import with_spatial_index
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.shear import (
-    MeasureShapes,
-    lensing,
-    pair_sums,
-    patches,
-    separations,
-    significance,
-    two_point,
-)
+from romandask.stages.analysis.shear import MeasureShapes, lensing
+from romandask.stages.analysis.two_point import pair_sums, patches, separations, significance, two_point
 
 COSMO = Cosmology()
 ARCMIN = np.radians(1 / 60)

@@ -70,7 +70,7 @@ def tile_units(survey: Survey, name: str, tiles: Sequence[str], bands: Sequence[
     if wrong:
         raise UserError(f"band {wrong[0]!r}: {name} has {', '.join(known)}")
     units = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-    return units_named(survey.product(f"coadds/{name}"), units, "tile")
+    return units_named(survey.output(f"coadds/{name}").product, units, "tile")
 
 
 def units_named(product: ImageProduct, names: Sequence[str], kind: str) -> list[int]:

@@ -219,6 +219,21 @@ def _template_survey(context: SurveyContext) -> str | None:
     return next((name for name, instrument in context.instruments.items() if band in instrument.bands), None)
 
 
+def science_survey(context: SurveyContext) -> str:
+    """Return the survey that has the science band, from which the template is subtracted.
+
+    Raises
+    ------
+    UserError
+        If no survey has the band.
+    """
+    settings = context.pipeline.differences
+    for name, instrument in context.instruments.items():
+        if settings.science in instrument.bands:
+            return name
+    raise UserError(f"difference images need the bands {settings.template} and {settings.science}")
+
+
 def has_differences(context: SurveyContext, survey: str) -> bool:
     """Return whether a survey has the science band and any survey the template band (the `exists` of the stage)."""
     bands = context.instruments[survey].bands

@@ -24,7 +24,7 @@ from romandask.survey import Survey
 from romandask.survey import open_survey as open  # noqa: A004
 
 __version__ = _version("romandask")
-# with more threads linear algebra rounds its sums otherwise, and pixels would depend on how many cores there are
+# the rounding of sums in linear algebra depends on the number of threads; pixels must not depend on the number of cores
 threadpool_limits(limits=1, user_api="blas")
 
 __all__ = [

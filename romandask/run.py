@@ -1,4 +1,4 @@
-"""Plan, run and explain a survey, and the status of a store: one path for the command line and for Python."""
+"""Plan, run, explain and verify a survey, and report the status of its store, from the command line and Python."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
+from typing import Any
 
 from rich.console import Console
 
@@ -48,68 +49,76 @@ PACKAGES = (
     "xarray",
     "zarr",
 )
-"""Packages whose versions are written into the store."""
+"""Packages whose versions are written to the store."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedStage:
-    """A row of the plan."""
+    """What a plan says about one product."""
 
     stage: str
+    """Name of the product, for example `coadds/roman`."""
     units: int
+    """Number of units."""
     bytes: int
-    """Uncompressed size of the images; 0 for tables, whose size depends on what is found."""
+    """Uncompressed size of the images, bytes; 0 for tables, whose number of rows is not known in advance."""
     memory: int
     """Peak memory of a worker, bytes."""
     hours: float
-    """Hours of one core, as measured on a laptop."""
+    """Time on one core of a laptop, hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedStage:
-    """What a run would do in one stage."""
+    """What a run would do with the units of one product."""
 
     stage: str
+    """Name of the product."""
     made: int
+    """Number of units that would be made."""
     kept: int
+    """Number of units that are up to date."""
     reasons: dict[str, int]
-    """Number of units that would be made, by reason."""
+    """Number of units by the reason why they would be made, or could not be made."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageStatus:
-    """Units of a stage in a store."""
+    """Number of units of one product in a store."""
 
     stage: str
+    """Name of the product."""
     units: int | None
-    """None while the stages that decide it have not been made."""
+    """Number of units of the product; None as long as the products that determine it have not been made."""
     done: int
+    """Number of units that are stored."""
     failed: int
+    """Number of units that failed."""
 
 
 def plan(survey: Survey) -> list[PlannedStage]:
-    """Return units, bytes and peak memory of every stage; nothing is made but the pointings.
+    """Return the number of units, size, peak memory and time of every product. Only pointings are computed.
 
     Raises
     ------
     UserError
-        If a unit does not fit the memory of a worker, or an input file is not as it should be.
+        If a unit does not fit into the memory of a worker, or an input file cannot be used.
     """
     limit, products = survey.pipeline.run.memory_limit, stage_products(survey)
-    _ignore_stale_lists(survey, products)
+    _ignore_stale_unit_lists(survey, products)
     rows = []
-    for one in products:
-        product = survey.product(one.name)
+    for declared in products:
+        product = survey.product(declared.name)
         memory = product.bytes_per_unit + INTERPRETER
         if memory > limit * 2**30 and product.units:
             raise UserError(
-                f"{one.name} {product.names[0]} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
-                f"{one.stage.shrink_with}, or raise run.memory_limit"
+                f"{declared.name} {product.names[0]} needs {memory / 2**30:.1f} GiB, worker limit {limit:.1f} GiB: "
+                f"{declared.stage.shrink_with}, or raise run.memory_limit"
             )
         hours = len(product.units) * product.seconds_per_unit / 3600
         rows.append(
             PlannedStage(
-                stage=one.name, units=len(product.units), bytes=product.stored_bytes, memory=memory, hours=hours
+                stage=declared.name, units=len(product.units), bytes=product.stored_bytes, memory=memory, hours=hours
             )
         )
     return rows
@@ -123,41 +132,59 @@ def run(
     Parameters
     ----------
     survey : Survey
-        With a store.
-    selection : Selection or None
-        Stages; None for all. A unit of theirs whose inputs are not stored is skipped and reported.
+        Survey with a store.
+    runner : Runner
+        Makes the units: in this process, on worker processes or on a cluster.
+    reporter : Reporter
+        Shows the progress.
+    selection : Selection, optional
+        Products to make, by default all. A selected unit whose inputs are not stored is skipped and reported.
     retry : bool
-        Make again what failed in an earlier run; else it is skipped until something that it depends on changes.
-    """
-    selected = (selection or Selection()).of(stage_products(survey))
-    with _running(survey, selected, runner, reporter, retry) as this:
-        run_stages(runnable(survey, selected), this)
-    return this.summary
-
-
-def run_on(client: Client, pipeline: Pipeline, store: AnyPath | str, selection: Selection | None = None) -> Summary:
-    """Make and store what is stale, as `romandask run` does, on the cluster that a dask client is connected to.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        Of a cluster of any kind whose workers have one thread each.
-    pipeline : Pipeline
-        Settings of the survey (`load_pipeline`).
-    store : str or path
-        Folder, or s3://BUCKET/FOLDER.
-    selection : Selection or None
-        Stages; None for all.
+        Try again the units that failed in an earlier run. Otherwise they are skipped until something that they depend
+        on changes.
 
     Returns
     -------
     Summary
-        Numbers of units made and kept, and the units that failed. The report is another command, `romandask report`.
+        Numbers of units made and kept, and the units that failed.
 
     Raises
     ------
     UserError
-        If settings or store are not as they should be, or the workers are too small or of another version.
+        If the survey has no store or no such product, another run uses the store, or the store cannot be written.
+    """
+    selected = (selection or Selection()).of(stage_products(survey))
+    with _running(survey, selected, runner, reporter, retry) as current_run:
+        run_stages(runnable(survey, selected), current_run)
+    return current_run.summary
+
+
+def run_on(client: Client, pipeline: Pipeline, store: AnyPath | str, selection: Selection | None = None) -> Summary:
+    """Make and store the stale units of a survey, as `romandask run` does, on the cluster of a dask client.
+
+    The report is not written; `romandask report` does that.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Client of a cluster of any kind, whose workers have one thread each.
+    pipeline : Pipeline
+        Settings of the survey (see `load_pipeline`).
+    store : str or path
+        Folder of the store, or s3://BUCKET/FOLDER.
+    selection : Selection, optional
+        Products to make, by default all.
+
+    Returns
+    -------
+    Summary
+        Numbers of units made and kept, and the units that failed.
+
+    Raises
+    ------
+    UserError
+        If the settings or the store cannot be used, or the workers have too little memory or another version of
+        romandask.
     """
     survey = Survey(pipeline, Store(parse_path(store)))
     plan(survey)
@@ -167,86 +194,116 @@ def run_on(client: Client, pipeline: Pipeline, store: AnyPath | str, selection: 
 
 
 def explain(survey: Survey, selection: Selection | None = None, retry: bool = False) -> list[ExplainedStage]:
-    """Return, stage by stage, how many units a run would make and why, making nothing.
+    """Return how many units of each product a run would make, and why. Nothing is made.
 
-    A unit that depends on a unit that will be made is counted, though its inputs may turn out the same.
+    Units that depend on a unit that would be made are counted, although its content may turn out to be unchanged.
+
+    Parameters
+    ----------
+    survey : Survey
+        Survey with a store.
+    selection, retry
+        As in `run`.
     """
     selected = (selection or Selection()).of(stage_products(survey))
-    _ignore_stale_lists(survey, selected)
-    store, coming = _store_of(survey), set[tuple[str, str]]()
+    _ignore_stale_unit_lists(survey, selected)
+    store, to_be_made = _store_of(survey), set[tuple[str, str]]()
     rows = []
-    for one in selected:
-        product = survey.product(one.name)
-        todo = find_stale(product, store, coming, retry)
-        coming |= {(product.stage, product.names[task.index]) for task in todo.tasks}
+    for declared in selected:
+        product = survey.product(declared.name)
+        todo = find_stale(product, store, to_be_made, retry)
+        to_be_made |= {(product.stage, product.names[task.index]) for task in todo.tasks}
         reasons = Counter(task.why for task in todo.tasks)
-        reasons += Counter({"an input is missing": len(todo.blocked), "set aside, it failed": len(todo.failed)})
+        reasons += Counter({"an input is missing": len(todo.blocked), "skipped after failure": len(todo.failed)})
         rows.append(
-            ExplainedStage(stage=one.name, made=len(todo.tasks), kept=todo.kept, reasons=dict(reasons.most_common()))
+            ExplainedStage(
+                stage=declared.name, made=len(todo.tasks), kept=todo.kept, reasons=dict(reasons.most_common())
+            )
         )
     return rows
 
 
 def ingest(survey: Survey, runner: Runner, reporter: Reporter) -> dict[str, int]:
-    """Make and store the truth catalogs alone; return rows `in` the source, `out` and `quarantined`.
+    """Make and store only the truth catalogs of a survey.
+
+    Returns
+    -------
+    dict of str to int
+        Number of rows `in` the source catalogs, `out` in the truth catalogs, and `quarantined`.
 
     Raises
     ------
     RuntimeError
-        If the numbers do not add up.
+        If a unit failed, or `in` is not the sum of `out` and `quarantined`.
     """
     selected = Selection(("truth",)).of(stage_products(survey))
-    with _running(survey, selected, runner, reporter, retry=True) as this:
-        run_stages(runnable(survey, selected), this)
-    tables = [survey.product(name) for name in ("truth/galaxies", "truth/stars")]
+    with _running(survey, selected, runner, reporter, retry=True) as current_run:
+        run_stages(runnable(survey, selected), current_run)
+    tables = [survey.output(name) for name in ("truth/galaxies", "truth/stars")]
     out = sum(int(table.column("n_rows").sum()) for table in tables)
     quarantined = {row["stage"]: row["rows"] for row in run_figures(_store_of(survey))}.get("truth/quarantine", 0)
-    counts = {"in": source_rows(survey.product("truth/ingested")), "out": out, "quarantined": quarantined}
-    if this.summary.failed or counts["in"] != counts["out"] + counts["quarantined"]:
-        raise RuntimeError(f"rows are missing: {counts}; failed units: {this.summary.failed}")
+    counts = {"in": source_rows(survey.output("truth/ingested")), "out": out, "quarantined": quarantined}
+    failures = current_run.summary.failed
+    if failures or counts["in"] != counts["out"] + counts["quarantined"]:
+        raise RuntimeError(f"rows are missing: {counts}; failed units: {failures}")
     return counts
 
 
 def status(survey: Survey) -> list[StageStatus]:
-    """Return the units of every stage of a store: all of them, those done and those that failed."""
+    """Return the number of units of every product: all units, those that are stored, and those that failed."""
     store = _store_of(survey)
     products = stage_products(survey)
-    done = {one.name: len(store.recorded(one.name)) for one in products}
+    done = {product.name: len(store.recorded(product.name)) for product in products}
     rows = []
-    for one in products:
-        known = all(done[name] for name in one.known_after)
-        units = len(survey.product(one.name).units) if known else None
-        rows.append(StageStatus(stage=one.name, units=units, done=done[one.name], failed=len(failed(store, one.name))))
+    for product in products:
+        name, units_known = product.name, all(done[source] for source in product.known_after)
+        units = len(survey.product(name).units) if units_known else None
+        rows.append(StageStatus(stage=name, units=units, done=done[name], failed=len(failed(store, name))))
     return rows
 
 
 def verify_store(survey: Survey, only: str | None = None) -> Iterator[Verified]:
-    """Yield, stage by stage, which units are not as they were written; nothing is changed."""
+    """Yield, for each product, the stored units whose content is not what was written. Nothing is changed.
+
+    Parameters
+    ----------
+    survey : Survey
+        Survey with a store.
+    only : str, optional
+        Name of one product; by default all are verified.
+    """
     yield from verify(runnable(survey, stage_products(survey)), _store_of(survey), only)
 
 
 def forget_damaged(survey: Survey, verified: Verified) -> None:
-    """Remove the records of the damaged units of a stage, so that the next run makes them again."""
+    """Remove the records of the damaged units of a product, so that the next run makes them again."""
     forget(_store_of(survey), verified)
 
 
 def last_event(survey: Survey) -> str:
-    """Return one line about what the newest run of a store did last; empty where none has been logged."""
-    last = newest_event(_store_of(survey).log)
-    if last is None:
+    """Return one line about the last event of the newest run of a store; empty if no run has been logged."""
+    event = newest_event(_store_of(survey).log)
+    if event is None:
         return ""
-    what = {
+    templates = {
         "run": "it began, on {on}",
         "stage": "{stage}: {make} units to make",
         "unit": "{stage}/{unit} was made in {seconds} s",
         "failed": "{stage}/{unit} failed",
         "end": "it ended ({how}): made {made}, kept {kept}, failed {failed}",
     }
-    return f"newest run, {last['time']}: {what[last['event']].format(**last)}"
+    return f"newest run, {event['time']}: {templates[event['event']].format(**event)}"
 
 
-def run_figures(store: Store) -> list[dict]:
-    """Return, stage by stage, units, seconds of work, bytes, rows and peak memory of a worker, from the manifest."""
+def run_figures(store: Store) -> list[dict[str, Any]]:
+    """Return what the manifest says about each product.
+
+    Returns
+    -------
+    list of dict
+        `stage`, `units`, `seconds` (working time of all workers), `bytes`, `rows`, `peak_bytes` (largest peak memory of
+        a worker) and `warnings` (their number), one entry per product with units.
+    """
     rows = []
     for stage in store.stages():
         records = [record for _, record in read_records(store, stage) if record]
@@ -266,40 +323,41 @@ def run_figures(store: Store) -> list[dict]:
 
 
 def stored_versions(store: Store) -> dict[str, str]:
-    """Return the package versions that the store was made with."""
+    """Return the versions of packages, by name, that the store was made with."""
     return json.loads((store.root / "versions.json").read_text())
 
 
 def runnable(survey: Survey, products: list[StageProduct]) -> list[RunnableStage]:
-    """Return products of a survey as the engine runs them."""
-    deciding = {name for one in products for name in one.known_after}
-    return [_runnable(survey, one, deciding) for one in products]
+    """Return products of a survey in the form in which the engine runs and verifies them."""
+    unit_lists = {name for product in products for name in product.known_after}
+    return [_runnable(survey, product, unit_lists) for product in products]
 
 
-def _runnable(survey: Survey, one: StageProduct, deciding: set[str]) -> RunnableStage:
-    stage = one.stage
+def _runnable(survey: Survey, product: StageProduct, unit_lists: set[str]) -> RunnableStage:
+    """Return one product for the engine; `unit_lists` are the products that determine which units others have."""
+    stage = product.stage
 
     def ended(made: int) -> None:
-        if one.name in deciding:
-            survey.use_stored(one.name)
+        if product.name in unit_lists:
+            survey.use_stored(product.name)
 
     finish = None if stage.finish is None else partial(stage.finish, survey, _store_of(survey))
     return RunnableStage(
-        name=one.name,
-        product=lambda: survey.product(one.name),
-        reads=one.reads,
-        known_after=one.known_after,
+        name=product.name,
+        product=lambda: survey.product(product.name),
+        reads=product.reads,
+        known_after=product.known_after,
         sky=stage.sky,
         finish=finish,
         ended=ended,
     )
 
 
-def _ignore_stale_lists(survey: Survey, products: list[StageProduct]) -> None:
-    """Let a survey make anew what decides which units some products have, where the store's is stale."""
+def _ignore_stale_unit_lists(survey: Survey, products: list[StageProduct]) -> None:
+    """Let a survey make, not read, the stale products that determine which units the given products have."""
     if survey.store is None:
         return
-    for name in sorted({name for one in products for name in one.known_after}):
+    for name in sorted({name for product in products for name in product.known_after}):
         todo = find_stale(survey.product(name), survey.store)
         if todo.tasks or todo.failed:
             survey.ignore_stored(name)
@@ -309,24 +367,25 @@ def _ignore_stale_lists(survey: Survey, products: list[StageProduct]) -> None:
 def _running(
     survey: Survey, products: list[StageProduct], runner: Runner, reporter: Reporter, retry: bool
 ) -> Iterator[Run]:
-    """Hold the store, write the resolved settings and package versions, and log how the run begins and ends."""
+    """Lock the store, write the settings and package versions, and log the start and the end of the run."""
     store = _store_of(survey)
     with locked(store.root):
         versions = {name: version(name) for name in PACKAGES}
         write_bytes(store.pipeline, survey.pipeline.to_yaml().encode())
         write_json(store.root / "versions.json", versions)
         write_checksums(store, "store", [store.pipeline, store.root / "versions.json"])
-        _ignore_stale_lists(survey, products)
-        this = Run(store, runner, reporter, Log(store.log), retry)
-        this.log.write("run", pipeline=survey.pipeline.name, on=runner.description, versions=versions)
+        _ignore_stale_unit_lists(survey, products)
+        current_run = Run(store, runner, reporter, Log(store.log), retry)
+        current_run.log.write("run", pipeline=survey.pipeline.name, on=runner.description, versions=versions)
         end = "stopped"
         try:
-            with this.ends:
-                yield this
+            with current_run.ends:
+                yield current_run
             end = "done"
         finally:
-            made, kept = sum(this.summary.made.values()), sum(this.summary.kept.values())
-            this.log.write("end", how=end, made=made, kept=kept, failed=len(this.summary.failed))
+            summary = current_run.summary
+            made, kept = sum(summary.made.values()), sum(summary.kept.values())
+            current_run.log.write("end", how=end, made=made, kept=kept, failed=len(summary.failed))
 
 
 def _store_of(survey: Survey) -> Store:

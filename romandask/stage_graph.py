@@ -1,4 +1,4 @@
-"""The stages of a survey: their declarations in order, the products that a survey has of them, and what each reads."""
+"""The stages of a survey: all declarations in order, the products of a survey, and which product reads which."""
 
 from __future__ import annotations
 
@@ -51,52 +51,53 @@ STAGES: tuple[Stage, ...] = (
     *MATCHES,
     *CHANCE,
     *STATISTICS,
-    # no stage reads it: it runs where other stages leave workers free
+    # no stage reads this one: at the end it uses the workers that other stages leave free
     TRUTH_INDEX,
     PSF_IMAGES,
 )
-"""Each stage after those that it reads. A new stage is one line here."""
+"""All stages, each after the stages that it reads. A new stage is one line here."""
 
 
 @dataclass(frozen=True)
 class StageProduct:
-    """One product that a survey has of a stage."""
+    """A product of a survey, and the products that it depends on."""
 
     name: str
-    """For example `coadds/roman`; also its place in the store."""
+    """Name, for example `coadds/roman`; also the path of the product in the store."""
     stage: Stage
+    """Stage that makes the product."""
     survey: str
-    """Empty where the stage is not per survey."""
+    """Name of the instrument; empty if the stage is not per survey."""
     reads: frozenset[str]
-    """Names of the products whose units its units are made from."""
+    """Names of the products that the units of this one are made from."""
     known_after: frozenset[str]
-    """Names of the products whose content decides which units it has."""
+    """Names of the products whose content determines which units this one has."""
 
     @property
     def kind(self) -> str:
-        """First part of the name: `truth`, `coadds`, `matches`."""
+        """First part of the name, for example `truth`, `coadds` or `matches`."""
         return self.name.split("/")[0]
 
 
 def with_margins(stages: tuple[Stage, ...]) -> list[Stage]:
-    """Return stages, each catalog followed by the stage of its margin."""
-    found = []
+    """Return the given stages, with the stage of its margin after each HATS catalog."""
+    with_margin_stages = []
     for stage in stages:
-        found.append(stage)
+        with_margin_stages.append(stage)
         if stage.sky is not None:
-            found.append(
+            with_margin_stages.append(
                 replace(
                     stage,
                     name=stage.name + MARGIN,
                     build=partial(_margin_of, stage),
-                    unit=f"{stage.unit}, margin",
-                    summary="Rows of other partitions within 10 arcsec of each partition.",
+                    unit=f"margin of a {stage.unit}",
+                    summary="The rows of other partitions within at least 10 arcsec of each partition.",
                     reads=(stage.name,),
                     finish=None,
                     tables={},
                 )
             )
-    return found
+    return with_margin_stages
 
 
 def _margin_of(stage: Stage, context: SurveyContext, survey: str) -> TableProduct:
@@ -104,7 +105,7 @@ def _margin_of(stage: Stage, context: SurveyContext, survey: str) -> TableProduc
 
 
 def product_name(stage: Stage, survey: str) -> str:
-    """Return the name of the product of a stage for a survey (the empty string for a stage that is not per survey)."""
+    """Return the name of the product of a stage for a survey (an empty string if the stage is not per survey)."""
     if not stage.per_survey:
         return stage.name
     name = stage.name.removesuffix(MARGIN)
@@ -112,11 +113,18 @@ def product_name(stage: Stage, survey: str) -> str:
 
 
 EVERY_STAGE: tuple[Stage, ...] = tuple(with_margins(STAGES))
-"""The declared stages and those of margins."""
+"""All stages, including those of margins."""
 
 
 def find_stage(name: str, surveys: tuple[str, ...]) -> tuple[Stage, str]:
-    """Return the stage of a product and the survey that the product belongs to.
+    """Return the stage of a product, and the survey that the product belongs to.
+
+    Parameters
+    ----------
+    name : str
+        Name of the product, for example `coadds/roman`.
+    surveys : tuple of str
+        Names of the instruments.
 
     Raises
     ------
@@ -131,7 +139,7 @@ def find_stage(name: str, surveys: tuple[str, ...]) -> tuple[Stage, str]:
 
 
 def stage_products(context: SurveyContext) -> list[StageProduct]:
-    """Return the products that a run of a survey stores, each after those that it is made from."""
+    """Return the products that a run of a survey stores, each after the products that it reads."""
     surveys = tuple(context.instruments)
     present = [
         (stage, survey)
@@ -143,26 +151,38 @@ def stage_products(context: SurveyContext) -> list[StageProduct]:
     names = {product_name(stage, survey) for stage, survey in present}
     return [
         StageProduct(
-            product_name(stage, survey),
-            stage,
-            survey,
-            frozenset(_resolved(stage.reads, stage, survey, surveys)) & names,
-            frozenset(_resolved(stage.units_known_after, stage, survey, surveys)) & names,
+            name=product_name(stage, survey),
+            stage=stage,
+            survey=survey,
+            reads=frozenset(_resolved(stage.reads, stage, survey, surveys)) & names,
+            known_after=frozenset(_resolved(stage.units_known_after, stage, survey, surveys)) & names,
         )
         for stage, survey in present
     ]
 
 
 def _resolved(names: tuple[str, ...], reader: Stage, survey: str, surveys: tuple[str, ...]) -> set[str]:
-    """Return the products that the names of stages in a declaration stand for."""
-    found = set()
+    """Return the names of the products that a stage reads for a survey.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of stages as in `Stage.reads`.
+    reader : Stage
+        Stage that reads them.
+    survey : str
+        Survey for which it reads them.
+    surveys : tuple of str
+        Names of all instruments.
+    """
+    products = set()
     for name in names:
-        every, stage = name.endswith("/*"), _BY_NAME[name.removesuffix("/*")]
-        if stage.per_survey and (every or not reader.per_survey):
-            found |= {product_name(stage, one) for one in surveys}
+        all_surveys, stage = name.endswith("/*"), _BY_NAME[name.removesuffix("/*")]
+        if stage.per_survey and (all_surveys or not reader.per_survey):
+            products |= {product_name(stage, instrument) for instrument in surveys}
         else:
-            found.add(product_name(stage, survey))
-    return found
+            products.add(product_name(stage, survey))
+    return products
 
 
 _BY_NAME = {stage.name: stage for stage in EVERY_STAGE}
@@ -170,12 +190,12 @@ _BY_NAME = {stage.name: stage for stage in EVERY_STAGE}
 
 @dataclass(frozen=True)
 class Selection:
-    """Some of the stages, as a user names them."""
+    """A selection of products, as a user names them."""
 
     only: tuple[str, ...] = ()
-    """Names (`coadds/roman`) or kinds (`coadds`) of products; none for all."""
+    """Names (`coadds/roman`) or kinds (`coadds`) of products; empty for all."""
     start: str | None = None
-    """The first of them, in the order of the plan."""
+    """Name or kind of the first product, in the order of the plan; None for the first of all."""
 
     def of(self, products: list[StageProduct]) -> list[StageProduct]:
         """Return the selected products, in order.
@@ -183,16 +203,18 @@ class Selection:
         Raises
         ------
         UserError
-            If the survey has no such stage.
+            If the survey has no product of a given name or kind.
         """
         for name in (*self.only, *((self.start,) if self.start else ())):
             if not any(_is(product, name) for product in products):
                 kinds = ", ".join(dict.fromkeys(product.kind for product in products))
                 raise UserError(f"stage {name!r}: this survey has {kinds}, each followed by /<survey> or /<part>")
         first = next((k for k, product in enumerate(products) if self.start and _is(product, self.start)), 0)
-        chosen = products[first:]
-        return [one for one in chosen if not self.only or any(_is(one, name) for name in self.only)]
+        return [
+            product for product in products[first:] if not self.only or any(_is(product, name) for name in self.only)
+        ]
 
 
 def _is(product: StageProduct, name: str) -> bool:
+    """Return whether a name is that of a product, or its kind."""
     return name in (product.name, product.kind)

@@ -1,4 +1,4 @@
-"""Runs: the same bytes whatever the workers and whatever was killed; only what changed is made again."""
+"""Runs: the same bytes for any number of workers and after a kill; only stale units are made again."""
 
 import json
 import os
@@ -25,7 +25,7 @@ STAGES = (
 
 
 def products(store: Path) -> dict[str, bytes]:
-    """Bytes of every file of the products: not the manifest and logs (times), the report or the stored settings."""
+    """Return the bytes of every file of the products; manifest, logs, report and stored settings are left out."""
     skipped = ("manifest", "report", "log", "pipeline.yaml", "versions.json", ".lock")
     paths = [path for path in store.rglob("*") if path.is_file() and path.relative_to(store).parts[0] not in skipped]
     texts = {"zarr.json", "hats.properties"}
@@ -112,7 +112,7 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # what runs in the background has interrupts ignored, and so would its children
+        # a process in the background ignores interrupts, and its children inherit that
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     deadline = time.monotonic() + 240
@@ -131,9 +131,9 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
 
 
 def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
-    """An exposure that cannot be read: what needs it is set aside with its traceback, and the exit code is 1.
+    """If an exposure cannot be read, the units that need it fail with a traceback, and the exit code is 1.
 
-    It stays aside, for it would fail again, until it is asked for; repaired, it is what it was.
+    They are skipped after failure until --retry-failed; once the exposure is repaired, the output is as before.
     """
     done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert done.returncode == 0
@@ -164,27 +164,27 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     assert output_hashes(tmp_path / "s") == before
 
 
-def test_what_a_run_would_make_is_told_with_the_reason(one_worker):
-    def told(*arguments: str) -> str:
+def test_a_dry_run_explains_which_units_are_stale(one_worker):
+    def dry_run(*arguments: str) -> str:
         done = command("run", "tiny", "--store", "s", *MINI, "--dry-run", *arguments, cwd=one_worker.parent)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     before = output_hashes(one_worker)
     command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
-    assert told().strip() == "every other unit is kept"
-    lines = {line.split()[0]: line for line in told("detections.min_snr=8").splitlines() if " make " in line}
+    assert dry_run().strip() == "every other unit is kept"
+    lines = {line.split()[0]: line for line in dry_run("detections.min_snr=8").splitlines() if " make " in line}
     assert "changed: settings" in lines["detections/roman"]
     assert "changed: detections/roman" in lines["zero_points/roman"]
     assert not any(name.startswith(("truth/", "exposures", "coadds")) for name in lines)
-    # whatever an exposure is drawn with makes it again
+    # a change of any setting of the rendering makes exposures stale
     for setting in ("roman.psf_degree=1", "roman.charge_diffusion=0.3", "render.truncation=0.1", "seed=4"):
-        assert any(line.startswith("exposures/roman ") for line in told(setting).splitlines()), setting
-    assert any(line.startswith("coadds/rubin ") for line in told("rubin.atmosphere=von_karman").splitlines())
-    only = told("detections.min_snr=8", "--only", "detections/roman").splitlines()
+        assert any(line.startswith("exposures/roman ") for line in dry_run(setting).splitlines()), setting
+    assert any(line.startswith("coadds/rubin ") for line in dry_run("rubin.atmosphere=von_karman").splitlines())
+    only = dry_run("detections.min_snr=8", "--only", "detections/roman").splitlines()
     assert len([line for line in only if " make " in line]) == 1
     assert not any(
-        line.startswith("coadds") for line in told("coadds.pixfrac=0.8", "--from", "detections").splitlines()
+        line.startswith("coadds") for line in dry_run("coadds.pixfrac=0.8", "--from", "detections").splitlines()
     )
     assert output_hashes(one_worker) == before
     wrong = command("run", "tiny", "--store", "s", *MINI, "--only", "coads", cwd=one_worker.parent)
@@ -202,7 +202,7 @@ def test_a_stage_alone_makes_what_its_inputs_allow(tmp_path):
 
 
 def test_workers_of_a_cluster_elsewhere_make_the_same(one_worker, tmp_path):
-    """Scheduler and worker are processes of their own, in folders of their own; what does not fit them is refused."""
+    """Scheduler and worker are separate processes in separate folders; a run that does not fit them is refused."""
     arguments = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(tmp_path / "s.json")]
     environment = os.environ | {"DASK_CONFIG": str(ROOT / "pipelines" / "cluster" / "workers.yaml")}
 

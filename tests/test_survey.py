@@ -1,4 +1,4 @@
-"""The tiny survey as its user meets it: served products, owned objects, recovered stars."""
+"""The stored tiny survey through the public interface: products, objects and their agreement with the truth."""
 
 import dask
 import numpy as np
@@ -65,12 +65,12 @@ def test_the_spectra_that_the_truth_names_are_stored(survey, tiny_store, truth):
     assert set(library["sed"].values[used.unique()]) <= set(galaxy_templates(TEMPLATES, STEPS).names)
     assert library["sed"].values[int(truth["sed"].dropna().iloc[0])].startswith("blackbody_")
     at_500 = library["photons"].interp(wave=500.0).values
-    # cells are means: a line of a star or a galaxy may lie there
+    # samples are means over cells, which may contain a spectral line
     np.testing.assert_allclose(at_500, 1.0, rtol=2e-2)
 
 
-def test_single_rubin_exposures_are_there_for_the_asking(survey):
-    """They are not stored where coadds are drawn from the cadence: the image is sky, objects and their noise."""
+def test_single_rubin_exposures_are_made_on_demand(survey):
+    """Exposures are not stored if coadds are drawn from the cadence: the image is sky, objects and their noise."""
     dataset = survey.exposures("rubin").isel(exposure=0)
     image, truth, dq = dask.compute(*(dataset[name] for name in ("image", "truth", "dq")))
     exposure = exposure_of(survey.pointings("rubin").iloc[0])
@@ -109,13 +109,13 @@ def test_no_object_is_detected_by_two_tiles(survey):
 
 
 def isolated_stars(truth, region, band, radius, tolerance):
-    """Bright true stars whose neighbours within a radius (arcsec) have a small share of light: rows, true fluxes."""
+    """Return the rows of bright true stars whose neighbours within a radius (arcsec) are faint, and all true fluxes."""
     flux = truth[f"flux_{band}"].to_numpy()
     vectors = unit_vectors(truth["ra"], truth["dec"])
     chosen = []
     for row in np.flatnonzero(truth["star"] & region.contains(truth["ra"], truth["dec"], -3.0)):
         gap = np.linalg.norm(vectors - vectors[row], axis=1) / ARCSEC
-        # a neighbour further out may still reach in with its wings
+        # the wings of a bright neighbour reach further
         near = ((gap < radius) | ((gap < 3 * radius) & (flux > 0.1 * flux[row]))) & (gap > 0)
         if flux[near].sum() < tolerance * flux[row]:
             chosen.append(row)
@@ -135,10 +135,10 @@ def test_magnitudes_of_isolated_bright_stars_agree_with_truth_in_every_band(surv
         bright = (gap / ARCSEC < 0.2) & (value > 20 * error) & (flux[rows] < 2e5) & whole
         assert bright.sum() >= 1, f"{band}: no isolated bright star"
         difference = -2.5 * np.log10(value[bright] / flux[rows][bright])
-        # what the neighbours add, allowed by the choice above, is not in the errors
+        # the errors do not include the light of neighbours, which the selection allows
         sigma = np.hypot(1.0857 * error[bright] / value[bright], 0.01)
         assert (np.abs(difference) < 3 * sigma).all(), (band, difference, sigma)
-        # the fit of the PSF at the tile's centre agrees to its few per cent of pixel phase
+        # fits with the PSF of the tile centre agree to the few per cent by which the PSF varies with pixel phase
         fitted = -2.5 * np.log10(measured[f"{band}_psfFlux"].to_numpy()[bright] / flux[rows][bright])
         assert np.abs(np.median(fitted)) < 0.1
 
@@ -195,7 +195,7 @@ def test_groups_hold_every_object_and_the_matrix_counts_them(survey):
 
 
 def test_rubins_depths_are_those_of_its_visits(survey):
-    """Of point sources, against the depths of the same visits (SMTN-002), within a tenth of a magnitude.
+    """Depths of point sources agree with the depths of the same visits (SMTN-002) within a tenth of a magnitude.
 
     In u GalSim's throughput is that of Ivezic et al. (2019, table 2), whose visits are 0.30 mag less deep.
     """
@@ -218,7 +218,7 @@ def test_differences_are_noise_but_for_the_colours_of_objects(survey):
         image, rms = (dataset[name].isel(tile=tile).values for name in ("difference", "rms"))
         seen = rms > 0
         assert 1.4826 * np.median(np.abs(image[seen] / rms[seen])) == pytest.approx(1, abs=0.15)
-    # in pixels of 0.2 arcsec; the errors are those of noise alone
+    # in pixels of 0.2 arcsec
     for axis in ("dx", "dy"):
         assert abs(left[axis].median()) < 0.1
     assert np.median(np.hypot(left["dx"], left["dy"])) < 0.1
@@ -252,7 +252,7 @@ def test_the_map_of_objects_has_the_objects_of_the_table(survey):
 
 
 @pytest.mark.parametrize("name", ["roman", "rubin"])
-def test_magnitudes_are_calibrated_on_the_stars_there_are(survey, name):
+def test_magnitudes_are_calibrated_on_stars(survey, name):
     zero = survey.output(f"zero_points/{name}").load(0)
     assert len(zero) == 3 * len(survey.instruments[name].bands)
     assert (np.abs(zero["offset"]) < 0.5).all()
@@ -266,19 +266,19 @@ def test_magnitudes_are_calibrated_on_the_stars_there_are(survey, name):
 
 
 def test_the_psf_of_the_coadds_is_written_for_other_tools(survey, tiny_store, tmp_path):
-    place = (53.03, -40.007)
-    done = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", *map(str, place), "--band", "H158")
+    position = (53.03, -40.007)
+    done = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", *map(str, position), "--band", "H158")
     assert done.returncode == 0, done.stderr
     (path,) = tmp_path.glob("*.fits")
     image, header = fits.getdata(path), fits.getheader(path)
-    asked = survey.psf(*place, "H158")
+    asked = survey.psf(*position, "H158")
     np.testing.assert_array_equal(image, asked.values)
     assert [header[f"EXP{k:05d}"] for k in range(len(asked.attrs["exposures"]))] == asked.attrs["exposures"]
     assert header["CRPIX1"] - 1 == pytest.approx(asked.attrs["x"])
-    # the exposures are those of the set of the pixel there
+    # the exposures are those of the set of the pixel at the position
     coadd = survey.coadds("roman").sel(band="H158")
     tile = int(np.flatnonzero(coadd["tile"].values == header["TILE"])[0])
-    column, row = wcs_of(str(coadd["header"].values[tile])).all_world2pix(*place, 0)
+    column, row = wcs_of(str(coadd["header"].values[tile])).all_world2pix(*position, 0)
     count = coadd["nimages"].isel(tile=tile, y=int(np.rint(row)), x=int(np.rint(column)))
     assert int(count) == len(asked.attrs["exposures"])
     wrong = command("export", "coadd-psf", str(tiny_store), str(tmp_path), "--at", "10", "10")
@@ -293,7 +293,7 @@ def test_extinction_is_what_the_milky_ways_dust_takes_from_the_counterparts(surv
     assert len(galaxies) > 50
     for band in survey.instruments[name].bands:
         dimming = -2.5 * np.log10(galaxies[f"flux_{band}_y"] / galaxies[f"flux_{band}_noMW"])
-        # that of a flat spectrum; in blue bands a galaxy's colour changes it by some hundredths of itself
+        # the extinction is that of a flat spectrum; in blue bands it depends on the colour by a few per cent
         middle = float(dimming.median())
         assert middle > 0
         assert np.median(galaxies[f"{band}_extinction"] - dimming) == pytest.approx(0, abs=0.05 * middle)
@@ -301,7 +301,7 @@ def test_extinction_is_what_the_milky_ways_dust_takes_from_the_counterparts(surv
 
 @pytest.mark.parametrize("name", ["roman", "rubin"])
 def test_validation_agrees_with_the_noise_of_the_coadds(survey, name):
-    """Depth: that of a matched filter on white noise, less what the correlations of the noise cost."""
+    """The depth is that of a matched filter on white noise, minus the effect of the correlation of the noise."""
     depth = survey.depths(name)
     assert np.isfinite(depth).all()
     for position, band in enumerate(survey.bands(name)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from romandask.products.images import ImageProduct
-from romandask.products.units import Made
+from romandask.products.units import Made, Unit
 from romandask.storage.store import Store
 
 
@@ -36,7 +36,7 @@ class ImageSet:
         return self.product.names
 
     @property
-    def units(self) -> Any:
+    def units(self) -> Sequence[Unit]:
         """The units, in order."""
         return self.product.units
 

@@ -9,7 +9,8 @@ import pandas as pd
 
 from romandask.report import figures, joint_figures
 from romandask.report.html import image_of, table_of
-from romandask.stages.analysis.friends_of_friends import blend_pair, joint, length_name
+from romandask.stages.analysis.blend_pair import blend_pair, joint
+from romandask.stages.analysis.friends_of_friends import length_name
 from romandask.survey import Survey
 
 FIELD = 12.0

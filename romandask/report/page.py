@@ -13,7 +13,7 @@ from romandask.report import figures
 from romandask.report.html import image_of, table_of
 from romandask.report.joint import blends, difference_images, field
 from romandask.run import run_figures, stored_versions
-from romandask.stages.analysis.shear import significance
+from romandask.stages.analysis.two_point import significance
 from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth
 from romandask.stages.pointings import corners_of
 from romandask.storage.paths import AnyPath, bytes_below, write_bytes

@@ -17,7 +17,8 @@ from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.measurement.shear import signal_to_noise
 from romandask.model.settings import LensingSettings, TruthSettings
 from romandask.model.sky import Region
-from romandask.stages.analysis.shear import SHAPE_COLUMNS, significance, true_shapes, two_point
+from romandask.stages.analysis.shear import SHAPE_COLUMNS, true_shapes
+from romandask.stages.analysis.two_point import significance, two_point
 from romandask.stages.truth.catalogs import truth
 
 DENSITY = 69.0

@@ -1,1 +1,1 @@
-"""Measurements on the object tables: samples, blends, differences, shear, validation."""
+"""Analysis of object tables against the truth and between surveys: samples, groups, blends, shear, differences."""

@@ -1,6 +1,8 @@
-"""Statistics of the groups: the blend matrix, unrecognised blends against magnitude, and what they do to measurements.
+"""Blend statistics: the blend matrix, unrecognised blends by magnitude, and the colours and sizes of blends.
 
-An unrecognised blend is a group with one object of Rubin and two or more of Roman (Troxel et al. 2023, section 6).
+The statistics compare a `sharp` and a `blended` survey, by default Roman and Rubin. An unrecognised blend is a group
+with one object of the blended survey and two or more objects of the sharp survey (Troxel et al. 2023, section 6).
+Columns of tables are named after the default surveys and bands.
 """
 
 from __future__ import annotations
@@ -12,225 +14,183 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from romandask.products.hats import rows_around
+from romandask.model.errors import UserError
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.friends_of_friends import (
-    CODES,
-    Matches,
-    chance_of,
-    has_joint_analysis,
-    joint,
-    length_name,
-    matches_of,
+from romandask.stages.analysis.blend_pair import has_joint_analysis, joint
+from romandask.stages.analysis.friends_of_friends import Matches, chance_of, matches_of
+from romandask.stages.analysis.group_members import (
+    REAL,
+    GroupCounts,
+    PairSample,
+    Samples,
+    complete_groups,
+    count_groups,
+    is_real,
 )
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.stages.truth.catalogs import truth_of
 
 MAG_EDGES = np.arange(18.0, 28.01, 0.5)
-"""Bins of i magnitude."""
+"""Edges of the bins in magnitude, in the reference band of the blended survey (i of Rubin)."""
 COLOUR_EDGES = np.arange(-3.0, 8.01, 0.25)
-"""Bins of g - F184."""
+"""Edges of the bins in colour, mag: colour band of the blended minus that of the sharp survey (g - F184)."""
 SIZE_EDGES = np.arange(0.0, 2.001, 0.05)
-"""Bins of half-light radius, arcsec."""
-REAL = 0.05
-"""Share of a blend's true light in i that its second true object has at least for the blend to be real."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairSample:
-    """What the statistics know of the objects of one survey."""
-
-    table: TableProduct
-    """Its sample."""
-    code: int
-    """Number of the survey in the keys of objects."""
-    reference_band: str
-    """Band in which magnitudes are compared."""
-    colour_band: str
-    """Band of the colour between the two surveys."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Samples:
-    """What the statistics know of the objects in groups."""
-
-    sharp: PairSample
-    """The survey whose several objects are one of the other: Roman."""
-    blended: PairSample
-    """The survey whose blends are counted: Rubin."""
-    galaxies: TableProduct
-    """Truth."""
-    stars: TableProduct
-
-    @property
-    def both(self) -> tuple[PairSample, PairSample]:
-        """The two surveys."""
-        return self.sharp, self.blended
+"""Edges of the bins in half-light radius, arcsec."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """The tables of the statistics stage."""
+    """The products of the statistics stages."""
 
     blends: TableProduct
-    """Counts of groups by numbers of objects of each survey."""
+    """Number of groups for each combination of object counts in the two surveys (schema: catalogs/blends.yaml)."""
     unrecognised: TableProduct
-    """Unrecognised blends by i magnitude."""
+    """Unrecognised blends by magnitude (schema: catalogs/unrecognised.yaml)."""
     distributions: TableProduct
-    """Colours and sizes of Rubin's objects, of blends and of others."""
+    """Colours and sizes of single objects and of unrecognised blends (schema: catalogs/distributions.yaml)."""
     chance: TableProduct
-    """What `unrecognised` would be by chance alone."""
+    """The table `unrecognised` after the blended survey was shifted, so that groups form by chance."""
 
 
-def statistics(found: Matches, shifted: Matches, samples: Samples, lengths: tuple[float, ...]) -> Statistics:
-    """Return the lazy statistics of the groups of Roman and Rubin objects.
+def statistics(matched: Matches, shifted: Matches, samples: Samples, lengths: tuple[float, ...]) -> Statistics:
+    """Return the lazy statistics of the groups of two surveys.
 
     Parameters
     ----------
-    found, shifted : groups, and those of a sky in which Rubin's objects are moved
+    matched : Matches
+        Groups of the objects of both surveys.
+    shifted : Matches
+        Groups after the objects of the blended survey were shifted.
+    samples : Samples
+        Samples of both surveys and the truth.
+    lengths : tuple of float, arcsec
+        Linking lengths for which statistics are computed.
+
+    Returns
+    -------
+    Statistics
+        Four tables, each with one unit.
     """
-    state = {
+    unit_settings = {
         "lengths": lengths,
-        "bands": [[one.code, one.reference_band, one.colour_band] for one in samples.both],
+        "bands": [[sample.code, sample.reference_band, sample.colour_band] for sample in samples.both],
         "real": REAL,
         "edges": [MAG_EDGES.tolist(), COLOUR_EDGES.tolist(), SIZE_EDGES.tolist()],
     }
 
-    def table(name: str, groups: Matches, kind: type[_Table], columns: str = "") -> TableProduct:
-        products = (groups.groups, groups.merged, *(one.table for one in samples.both), samples.galaxies, samples.stars)
+    def table(name: str, groups: Matches, maker: type[_Table], schema_name: str) -> TableProduct:
+        tables = (sample.table for sample in samples.both)
+        products = (groups.groups, groups.merged, *tables, samples.galaxies, samples.stars)
         upstream = tuple((product.stage, unit) for product in products for unit in product.names)
         return TableProduct(
             stage=f"statistics/{name}",
-            units=(Unit("all", state, upstream),),
-            make=kind(groups, samples, lengths),
-            schema=schema(columns or name),
+            units=(Unit("all", unit_settings, upstream),),
+            make=maker(groups, samples, lengths),
+            schema=schema(schema_name),
             bytes_per_unit=500 << 20,
         )
 
     return Statistics(
-        table("blends", found, _Blends),
-        table("unrecognised", found, _Unrecognised),
-        table("distributions", found, _Distributions),
-        table("chance", shifted, _Unrecognised, "unrecognised"),
+        blends=table("blends", matched, _Blends, "blends"),
+        unrecognised=table("unrecognised", matched, _Unrecognised, "unrecognised"),
+        distributions=table("distributions", matched, _Distributions, "distributions"),
+        chance=table("chance", shifted, _Unrecognised, "unrecognised"),
     )
 
 
 def matrix(blends: pd.DataFrame, length: float) -> pd.DataFrame:
-    """Return the blend matrix: numbers of groups, Roman objects in rows and Rubin objects in columns."""
+    """Return the blend matrix for a linking length.
+
+    Parameters
+    ----------
+    blends : DataFrame
+        Schema: catalogs/blends.yaml.
+    length : float, arcsec
+
+    Returns
+    -------
+    DataFrame of int
+        Number of groups by number of objects of the sharp survey (index `n_roman`) and of the blended survey (columns
+        `n_rubin`).
+    """
     chosen = blends[np.isclose(blends["linking_length"], length)]
     return chosen.pivot(index="n_roman", columns="n_rubin", values="groups").fillna(0).astype(int)
 
 
-def whole_groups(found: Matches, samples: Samples) -> Iterator[pd.DataFrame]:
-    """Yield the objects of all groups, some at a time, no group in two parts.
+class SurveyStatistics:
+    """The statistics of the groups of a survey as tables in memory.
 
-    Columns: blended (True for an object of the blended survey), a column group_<length> a linking length, magnitude in
-    the reference band and in that of the colour (`other`), half_light_radius, counterpart (a number that tells true
-    objects apart; -1 for none) and true_flux, that of the counterpart in the blended survey's reference band, nJy.
+    The argument `linking_length` of its methods is one of `matches.linking_lengths`, arcsec, by default the first. They
+    raise UserError if it is another length.
+
+    Parameters
+    ----------
+    products : Statistics
+        Products that the tables are read from.
+    lengths : tuple of float, arcsec
+        Linking lengths for which there are statistics.
     """
-    merged = found.merged.load(0)["key"].to_numpy()
-    aside = []
-    for index, cell in enumerate(found.groups.pixels or ()):
-        groups = found.groups.load(index)
-        if not len(groups):
-            continue
-        frame = _described(groups, samples, cell, found.groups.order or 0)
-        # a group that crosses a border is with all others that do
-        crossing = np.isin(groups["key"].to_numpy(), merged)
-        aside.append(frame[crossing])
-        yield frame[~crossing]
-    if aside:
-        yield pd.concat(aside, ignore_index=True)
 
+    def __init__(self, products: Statistics, lengths: tuple[float, ...]):
+        self._products = products
+        self._lengths = lengths
 
-def _described(groups: pd.DataFrame, samples: Samples, cell: int, order: int) -> pd.DataFrame:
-    """Return the rows of `whole_groups` of one partition."""
-    band = samples.blended.reference_band
-    parts = []
-    for one in samples.both:
-        magnitude, other = f"{one.reference_band}_mag", f"{one.colour_band}_mag"
-        columns = ["objectId", magnitude, other, "half_light_radius", "truth_id", "star"]
-        rows = one.table.rows_in(np.array([cell]), order, columns)
-        values = {"magnitude": rows[magnitude].to_numpy(float), "other": rows[other].to_numpy(float)}
-        key = rows["objectId"].to_numpy(np.int64) * CODES + one.code
-        parts.append(rows[["half_light_radius", "truth_id", "star"]].assign(**values, key=key))
-    frame = groups.merge(pd.concat(parts, ignore_index=True), on="key", validate="one_to_one")
-    true = []
-    for star, product, number in ((False, samples.galaxies, "galaxy_id"), (True, samples.stars, "id")):
-        # a counterpart may lie beyond the border
-        rows = rows_around(product, cell, order, [number, f"flux_{band}"])
-        flux = rows[f"flux_{band}"].to_numpy(float)
-        true.append(pd.DataFrame({"truth_id": rows[number].to_numpy(np.int64), "star": star, "true_flux": flux}))
-    frame = frame.merge(pd.concat(true).drop_duplicates(["truth_id", "star"]), on=["truth_id", "star"], how="left")
-    # a star and a galaxy may have one number
-    counterpart = np.where(frame["truth_id"] >= 0, frame["truth_id"] * 2 + frame["star"], -1)
-    names = [name for name in frame.columns if name.startswith("group_")]
-    kept = [*names, "magnitude", "other", "half_light_radius", "true_flux"]
-    return frame[kept].assign(counterpart=counterpart, blended=frame["key"].to_numpy() % CODES == samples.blended.code)
+    def blends(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return the blend matrix: the number of groups for each combination of object counts in the two surveys.
 
+        Returns
+        -------
+        DataFrame of int
+            Index `n_roman`: objects of the sharp survey. Columns `n_rubin`: objects of the blended survey.
+        """
+        return matrix(self._products.blends.all_rows(), self._length(linking_length))
 
-@dataclass(frozen=True)
-class Counted:
-    """Groups of one linking length: of each object (n,) its group's number and, by group (m,), numbers of objects."""
+    def unrecognised(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return the number of unrecognised blends by magnitude (schema: catalogs/unrecognised.yaml)."""
+        return self._table(self._products.unrecognised, linking_length)
 
-    group: np.ndarray
-    sharp: np.ndarray
-    blended: np.ndarray
+    def chance(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return the number of unrecognised blends that form by chance (schema: catalogs/unrecognised.yaml).
 
-    @property
-    def blend(self) -> np.ndarray:
-        """(m,) True for unrecognised blends."""
-        return (self.blended == 1) & (self.sharp >= 2)
+        They are counted after the objects of the blended survey were shifted by 13 arcsec.
+        """
+        return self._table(self._products.chance, linking_length)
 
+    def distributions(self, linking_length: float | None = None) -> pd.DataFrame:
+        """Return colours and sizes of unrecognised blends and single objects (schema: catalogs/distributions.yaml)."""
+        return self._table(self._products.distributions, linking_length)
 
-def counted(rows: pd.DataFrame, length: float) -> Counted:
-    """Return the groups of some rows of `whole_groups`."""
-    _, group = np.unique(rows[f"group_{length_name(length)}"].to_numpy(), return_inverse=True)
-    blended, count = rows["blended"].to_numpy(), int(group.max(initial=-1)) + 1
-    return Counted(group, np.bincount(group[~blended], minlength=count), np.bincount(group[blended], minlength=count))
+    def _table(self, product: TableProduct, length: float | None) -> pd.DataFrame:
+        table = product.all_rows()
+        return table[np.isclose(table["linking_length"], self._length(length))].reset_index(drop=True)
 
-
-def real(rows: pd.DataFrame, groups: Counted) -> np.ndarray:
-    """True (m,) for groups whose Roman objects are two or more true ones, the second with a share of the light.
-
-    Where two objects are parts of one galaxy, or the second is nothing that Rubin could see, there is no blend.
-    """
-    sharp = (~rows["blended"] & (rows["counterpart"] >= 0)).to_numpy()
-    members = (
-        pd.DataFrame(
-            {
-                "group": groups.group[sharp],
-                "counterpart": rows["counterpart"].to_numpy()[sharp],
-                "flux": np.nan_to_num(rows["true_flux"].to_numpy(float)[sharp]),
-            }
-        )
-        .drop_duplicates(["group", "counterpart"])
-        .sort_values(["group", "flux"], ascending=[True, False])
-    )
-    total = np.bincount(members["group"], members["flux"], len(groups.sharp))
-    second = members[members.groupby("group").cumcount() == 1]
-    found = np.zeros(len(groups.sharp), bool)
-    found[second["group"]] = second["flux"].to_numpy() >= REAL * total[second["group"]]
-    return found
+    def _length(self, length: float | None) -> float:
+        length = self._lengths[0] if length is None else length
+        if not np.isclose(length, self._lengths).any():
+            raise UserError(f"linking length {length}: this survey has {', '.join(map(str, self._lengths))} arcsec")
+        return length
 
 
 @dataclass(frozen=True)
 class _Table(ABC):
-    found: Matches
+    """Makes the only unit of a statistics table."""
+
+    matched: Matches
     samples: Samples
     lengths: tuple[float, ...]
+    """Linking lengths, arcsec."""
 
-    def parts(self) -> Iterator[tuple[float, pd.DataFrame, Counted]]:
-        """Yield, for every part of the groups and each linking length, rows and their groups."""
-        for rows in whole_groups(self.found, self.samples):
+    def parts(self) -> Iterator[tuple[float, pd.DataFrame, GroupCounts]]:
+        """Yield linking length, objects and groups, for each part of the objects and each linking length."""
+        for rows in complete_groups(self.matched, self.samples):
             for length in self.lengths:
-                yield length, rows, counted(rows, length)
+                yield length, rows, count_groups(rows, length)
 
     @abstractmethod
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the rows of the one unit."""
+        """Return the rows of the unit."""
 
 
 class _Blends(_Table):
@@ -245,7 +205,7 @@ class _Blends(_Table):
         if not counts:
             return pd.DataFrame(columns=schema("blends").names)
         keys = ["linking_length", "n_roman", "n_rubin"]
-        return pd.concat(counts).groupby(keys, as_index=False)["groups"].sum()
+        return pd.concat(counts).groupby(keys)["groups"].sum().reset_index()
 
 
 class _Unrecognised(_Table):
@@ -255,9 +215,11 @@ class _Unrecognised(_Table):
         for length, rows, groups in self.parts():
             blended = rows["blended"].to_numpy()
             group, magnitude = groups.group[blended], rows["magnitude"].to_numpy()[blended]
-            blend, seen = groups.blend, groups.sharp >= 1
-            for number, chosen in enumerate((seen | True, seen, blend, blend & real(rows, groups), ~seen)):
-                totals[length][number] += np.histogram(magnitude[chosen[group]], MAG_EDGES)[0]
+            is_blend, with_sharp = groups.is_blend, groups.sharp >= 1
+            every = np.ones(len(groups.sharp), bool)
+            selections = (every, with_sharp, is_blend, is_blend & is_real(rows, groups), ~with_sharp)
+            for number, selected in enumerate(selections):
+                totals[length][number] += np.histogram(magnitude[selected[group]], MAG_EDGES)[0]
         parts = []
         for length, total in totals.items():
             counts = dict(zip(names, total, strict=True))
@@ -288,21 +250,21 @@ class _Distributions(_Table):
         }
         for length, rows, groups in self.parts():
             blended = rows["blended"].to_numpy()
-            # of Roman's objects in a group the brightest
-            bright = (
+            # the colour is measured against the brightest object of the sharp survey in the group
+            brightest = (
                 rows[~blended].assign(group=groups.group[~blended]).sort_values("magnitude").drop_duplicates("group")
             )
-            red = np.full(len(groups.sharp), np.nan)
-            red[bright["group"]] = bright["other"]
+            sharp_magnitude = np.full(len(groups.sharp), np.nan)
+            sharp_magnitude[brightest["group"]] = brightest["colour_magnitude"]
             group = groups.group[blended]
             values = {
-                "colour": rows["other"].to_numpy()[blended] - red[group],
+                "colour": rows["colour_magnitude"].to_numpy()[blended] - sharp_magnitude[group],
                 "size": rows["half_light_radius"].to_numpy(float)[blended],
             }
-            one = groups.blended[group] == 1
-            for number, chosen in enumerate((one & (groups.sharp[group] == 1), groups.blend[group])):
+            is_single = (groups.blended[group] == 1) & (groups.sharp[group] == 1)
+            for number, selected in enumerate((is_single, groups.is_blend[group])):
                 for name, value in values.items():
-                    totals[length, name][number] += np.histogram(value[chosen], edges[name])[0]
+                    totals[length, name][number] += np.histogram(value[selected], edges[name])[0]
         return pd.concat(
             [
                 pd.DataFrame(
@@ -322,7 +284,7 @@ class _Distributions(_Table):
 
 
 def statistics_of(context: SurveyContext) -> Statistics:
-    """Return the tables of the statistics of a survey's groups."""
+    """Return the lazy statistics of the groups of a survey."""
     truth = context.once(truth_of)
     pair = context.once(joint)
     sharp, blended = (
@@ -334,41 +296,56 @@ def statistics_of(context: SurveyContext) -> Statistics:
         )
         for name in (pair.sharp, pair.blended)
     )
-    known = Samples(sharp=sharp, blended=blended, galaxies=truth.galaxies, stars=truth.stars)
+    samples = Samples(sharp=sharp, blended=blended, galaxies=truth.galaxies, stars=truth.stars)
     lengths = context.pipeline.matches.linking_lengths
-    found = statistics(context.once(matches_of), context.once(chance_of), known, lengths)
+    products = statistics(context.once(matches_of), context.once(chance_of), samples, lengths)
     store = context.store
-    return found if store is None else Statistics(*(table.stored(store) for table in vars(found).values()))
+    if store is None:
+        return products
+    return Statistics(**{name: table.stored(store) for name, table in vars(products).items()})
 
 
-def _stage(part: str, build: Callable[[Statistics], TableProduct], kind: str, schema_: str, summary: str) -> Stage:
+def _stage(
+    part: str, build: Callable[[Statistics], TableProduct], schema_name: str, summary: str, groups: str = "matches"
+) -> Stage:
     return Stage(
         name=f"statistics/{part}",
         build=lambda context, _: build(context.once(statistics_of)),
         exists=has_joint_analysis,
-        reads=(f"{kind}/groups", f"{kind}/merged", "samples", "truth/galaxies", "truth/stars"),
+        reads=(f"{groups}/groups", f"{groups}/merged", "samples", "truth/galaxies", "truth/stars"),
         units_known_after=UNITS_FROM_POINTINGS,
         unit="survey",
         summary=summary,
-        tables={schema_: f"statistics/{part}/"},
+        tables={schema_name: f"statistics/{part}/"},
     )
 
 
 STATISTICS = (
-    _stage("blends", lambda s: s.blends, "matches", "blends", "Blend matrix: groups by numbers of objects."),
+    _stage(
+        "blends",
+        lambda products: products.blends,
+        schema_name="blends",
+        summary="The blend matrix: the number of groups for each combination of object counts in the two surveys.",
+    ),
     _stage(
         "unrecognised",
-        lambda s: s.unrecognised,
-        "matches",
-        "unrecognised",
-        "Unrecognised blends by magnitude, and how many of them are real.",
+        lambda products: products.unrecognised,
+        schema_name="unrecognised",
+        summary="The number of unrecognised blends by magnitude, and how many of them are blends of two or more true "
+        "objects.",
     ),
     _stage(
         "distributions",
-        lambda s: s.distributions,
-        "matches",
-        "distributions",
-        "Colours and sizes of blends and of single objects.",
+        lambda products: products.distributions,
+        schema_name="distributions",
+        summary="The colours and sizes of unrecognised blends and of single objects.",
     ),
-    _stage("chance", lambda s: s.chance, "chance", "unrecognised", "Unrecognised blends that chance makes."),
+    _stage(
+        "chance",
+        lambda products: products.chance,
+        schema_name="unrecognised",
+        summary="The number of unrecognised blends by magnitude that form by chance, after the blended survey was "
+        "shifted by 13 arcsec.",
+        groups="chance",
+    ),
 )

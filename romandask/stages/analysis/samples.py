@@ -1,8 +1,9 @@
-"""Samples: the objects of each survey that the joint analysis counts, clean and above their completeness limit."""
+"""Samples: the clean objects of each survey, down to its completeness limit, that the joint analysis uses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -19,26 +20,41 @@ from romandask.products.units import LazyUnits, Unit
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 
 ALLOWED = FLAGS["deblended"] | FLAGS["kron_nonpositive"]
-"""Flags that clean objects may have: of Source Extractor's 1 and 2, which Troxel et al. (2023) allow, sep has one; that
-an aperture is the least one Source Extractor does not tell."""
+"""Flags that clean objects may have. Troxel et al. (2023) allow the flags 1 and 2 of Source Extractor, of which sep has
+one. `kron_nonpositive` is allowed because Source Extractor does not flag an aperture of the smallest size."""
 EDGES = np.arange(16.0, 30.001, 0.1)
-"""Bins of magnitude in which objects are counted for their limit."""
+"""Edges of the magnitude bins in which objects are counted to find the limit."""
 
 
 def limits(objects: TableProduct, matched: TableProduct, settings: MatchSettings, band: str) -> TableProduct:
-    """Return the lazy limit of a survey's sample in its reference band (schema: catalogs/limits.yaml), one unit.
+    """Return the lazy magnitude limit of a survey's sample (schema: catalogs/limits.yaml), one unit.
 
-    It is where the counts of clean objects fall to 80% of a power law fitted over 21-26 mag (Troxel et al. 2023,
-    section 6), unless the settings tell it; infinite for samples of all objects, and where there are too few to fit.
+    The limit is the magnitude at which the counts of clean objects fall to 80% of a power law fitted over 21-26 mag
+    (Troxel et al. 2023, section 6). `matches.limits` overrides it. It is infinite for samples of all objects, and if
+    there are too few objects for a fit.
+
+    Parameters
+    ----------
+    objects : TableProduct
+        Object table of the survey.
+    matched : TableProduct
+        True counterparts of the objects (schema: catalogs/truth_match.yaml).
+    settings : MatchSettings
+        Section `matches` of the pipeline.
+    band : str
+        Reference band, in which the limit holds.
     """
     stage = f"limits/{objects.stage.split('/')[1]}"
-    limit = (settings.limits or {}).get(band)
-    state = {"sample": settings.sample, "limit": limit, "band": band, "flags": ALLOWED}
-    told = np.inf if settings.sample == "all" else limit
-    sources = () if told is not None else tuple((p.stage, name) for p in (objects, matched) for name in p.names)
-    maker = _Limit(_Clean(objects, matched, (band,)), told, band)
+    override = (settings.limits or {}).get(band)
+    unit_settings = {"sample": settings.sample, "limit": override, "band": band, "flags": ALLOWED}
+    fixed_limit = np.inf if settings.sample == "all" else override
+    sources = () if fixed_limit is not None else tuple((p.stage, name) for p in (objects, matched) for name in p.names)
     return TableProduct(
-        stage=stage, units=(Unit("all", state, sources),), make=maker, schema=schema("limits"), bytes_per_unit=400 << 20
+        stage=stage,
+        units=(Unit("all", unit_settings, sources),),
+        make=_Limit(_Clean(objects, matched, (band,)), fixed_limit, band),
+        schema=schema("limits"),
+        bytes_per_unit=400 << 20,
     )
 
 
@@ -52,21 +68,34 @@ def samples(
 ) -> TableProduct:
     """Return the lazy sample of a survey's objects (schema: catalogs/samples.yaml), a HATS catalog.
 
+    An object is clean if it has no flags but those in `ALLOWED` and has a true counterpart. The sample contains the
+    clean objects whose dereddened magnitude is not fainter than the limit (Troxel et al. 2023, section 6). If
+    `matches.sample` is `all`, it contains every object.
+
     Parameters
     ----------
-    objects, matched, limit : objects, truth_match and limits of the survey
-    bands, band : all of the survey, and the reference band, in which the limit holds
-
-    A clean object has no flag but those allowed, a counterpart in the truth, and is not fainter than the limit,
-    dereddened (Troxel et al. 2023, section 6).
+    objects : TableProduct
+        Object table of the survey.
+    matched : TableProduct
+        True counterparts of the objects (schema: catalogs/truth_match.yaml).
+    limit : TableProduct
+        Magnitude limit (schema: catalogs/limits.yaml).
+    settings : MatchSettings
+        Section `matches` of the pipeline.
+    bands : tuple of str
+        Bands of the survey.
+    band : str
+        Reference band, in which the limit holds.
     """
-    state = {"sample": settings.sample, "bands": bands, "band": band, "flags": ALLOWED}
+    unit_settings = {"sample": settings.sample, "bands": bands, "band": band, "flags": ALLOWED}
     tiles = set(matched.names)
 
     def unit(index: int) -> Unit:
-        # an object's counterpart is in the table of its tile
+        # the counterpart of an object is in the truth_match table of its tile
         tables = tuple((matched.stage, name) for _, name in objects.units[index].inputs if name in tiles)
-        return Unit(objects.names[index], state, ((objects.stage, objects.names[index]), *tables, (limit.stage, "all")))
+        return Unit(
+            objects.names[index], unit_settings, ((objects.stage, objects.names[index]), *tables, (limit.stage, "all"))
+        )
 
     return TableProduct(
         stage=f"samples/{objects.stage.split('/')[1]}",
@@ -81,7 +110,7 @@ def samples(
 
 @dataclass(frozen=True)
 class _Clean:
-    """The rows of an object table with dereddened magnitudes, counterparts, and whether they are clean."""
+    """Returns the objects of a partition with dereddened magnitudes, true counterparts and whether they are clean."""
 
     objects: TableProduct
     matched: TableProduct
@@ -98,8 +127,8 @@ class _Clean:
             self.matched.select(k, ["objectId", "truth_id", "star"])
             for k in map(self.matched.names.index, frame["tile"].unique())
         ]
-        known = pd.concat(tables) if tables else self.matched.empty()[["objectId", "truth_id", "star"]]
-        frame = frame.merge(known, on="objectId", how="left", validate="one_to_one")
+        counterparts = pd.concat(tables) if tables else self.matched.empty()[["objectId", "truth_id", "star"]]
+        frame = frame.merge(counterparts, on="objectId", how="left", validate="one_to_one")
         frame["truth_id"] = frame["truth_id"].fillna(-1).astype(np.int64)
         frame["star"] = frame["star"].fillna(False).astype(bool)
         return frame.assign(clean=((frame["flags"] & ~ALLOWED) == 0) & (frame["truth_id"] >= 0))
@@ -107,16 +136,19 @@ class _Clean:
 
 @dataclass(frozen=True)
 class _Limit:
-    rows: _Clean
-    told: float | None
+    """Makes the magnitude limit of a survey."""
+
+    clean: _Clean
+    fixed_limit: float | None
+    """Limit, mag; None if it is measured."""
     band: str
 
     def __call__(self, index: int) -> pd.DataFrame:
-        limit, slope, counted = self.told, np.nan, 0
+        limit, slope, counted = self.fixed_limit, np.nan, 0
         if limit is None:
             counts = np.zeros(len(EDGES) - 1, np.int64)
-            for k in range(len(self.rows.objects.units)):
-                frame = self.rows(k)
+            for k in range(len(self.clean.objects.units)):
+                frame = self.clean(k)
                 counts += np.histogram(frame.loc[frame["clean"], f"{self.band}_mag"], EDGES)[0]
             limit, slope = counts_limit(counts, EDGES)
             counted = int(counts.sum())
@@ -125,13 +157,15 @@ class _Limit:
 
 @dataclass(frozen=True)
 class _Sample:
-    rows: _Clean
+    """Makes one partition of a sample."""
+
+    clean: _Clean
     limit: TableProduct
-    sample: str
+    sample: Literal["clean", "all"]
     band: str
 
     def __call__(self, index: int) -> pd.DataFrame:
-        frame = self.rows(index)
+        frame = self.clean(index)
         if self.sample == "all":
             return frame
         faintest = float(self.limit.load(0)["limit"].iloc[0])
@@ -139,17 +173,17 @@ class _Sample:
 
 
 def build_limits(context: SurveyContext, survey: str) -> TableProduct:
-    """Return the lazy magnitude limit of an instrument's sample.
+    """Return the lazy magnitude limit of a survey's sample (the `build` of the stage).
 
     Raises
     ------
     UserError
-        If `matches.limits` names a band that is no reference band.
+        If `matches.limits` names a band that is not a reference band.
     """
     settings = context.pipeline.matches
     bands = {instrument.reference_band for instrument in context.instruments.values()}
-    # one pipeline's limits also serve its runs with a survey, or that band, left out
-    usual = {kind.usual_reference_band for kind in instrument_types().values()}
+    # also allow the usual reference bands, so that the limits of a pipeline hold for runs without a survey or band
+    usual = {settings_type.usual_reference_band for settings_type in instrument_types().values()}
     if unknown := set(settings.limits or {}) - bands - usual:
         raise UserError(f"matches.limits: {', '.join(sorted(unknown))}: they are those of {', '.join(sorted(bands))}")
     tables = context.output(f"objects/{survey}"), context.output(f"truth_match/{survey}")
@@ -157,10 +191,16 @@ def build_limits(context: SurveyContext, survey: str) -> TableProduct:
 
 
 def build_samples(context: SurveyContext, survey: str) -> TableProduct:
-    """Return the lazy sample of an instrument's objects."""
+    """Return the lazy sample of a survey's objects (the `build` of the stage)."""
     instrument = context.instruments[survey]
-    tables = (context.output(f"{stage}/{survey}") for stage in ("objects", "truth_match", "limits"))
-    return samples(*tables, context.pipeline.matches, instrument.bands, instrument.reference_band)
+    return samples(
+        context.output(f"objects/{survey}"),
+        context.output(f"truth_match/{survey}"),
+        context.output(f"limits/{survey}"),
+        context.pipeline.matches,
+        instrument.bands,
+        instrument.reference_band,
+    )
 
 
 LIMITS = Stage(
@@ -170,7 +210,7 @@ LIMITS = Stage(
     reads=("objects", "truth_match"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="survey",
-    summary="The magnitude at which counts of clean objects fall to 80% of a power law.",
+    summary="The magnitude in the reference band at which the counts of clean objects fall to 80% of a power law.",
     tables={"limits": "limits/<survey>/"},
 )
 SAMPLES = Stage(
@@ -180,7 +220,7 @@ SAMPLES = Stage(
     reads=("objects", "truth_match", "limits"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="HEALPix cell",
-    summary="Clean objects to that limit, with dereddened magnitudes and their true counterparts.",
+    summary="The clean objects down to the magnitude limit, with dereddened magnitudes and true counterparts.",
     sky=("coord_ra", "coord_dec"),
     shrink_with="raise detections.order",
     tables={"samples": "samples/<survey>/"},

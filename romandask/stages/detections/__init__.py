@@ -1,1 +1,1 @@
-"""Objects of each tile, their photometry, their true counterparts and their zero points."""
+"""Detection and photometry of the objects of each tile, their true counterparts and their zero points."""

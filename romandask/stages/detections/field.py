@@ -1,7 +1,7 @@
-"""Fields: images of one piece of sky in some bands, from a coadd or from anywhere, for detection and photometry.
+"""Fields: images of one area of the sky in one or more bands, from which objects are detected and measured.
 
-A field needs, in each band, an image, its weight, a realisation of its noise and its PSF. Bands are in memory one at a
-time, and for the detection image some rows of all bands.
+A field has, in each band, an image, its weight, a realisation of its noise and its PSF. Photometry holds one band in
+memory at a time; the detection image is made from small windows of all bands.
 """
 
 from __future__ import annotations
@@ -29,101 +29,131 @@ from romandask.stages.coadds.tile_maker import Coadds
 from romandask.storage.arrays import chunk_side
 
 Window = tuple[slice, ...]
-"""Rows and columns of a plane."""
+"""Rows and columns of an image."""
 WHOLE: Window = (slice(None), slice(None))
+"""Window that covers an image."""
 _CHUNKS = 3
-"""Chunks in a row, of all bands, that are in memory for the detection image."""
+"""Width, in chunks, of the windows of all bands that are in memory while the detection image is made."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Field(ABC):
-    """Images of one piece of sky in some bands, all on one pixel grid."""
+    """Images of one area of the sky in one or more bands, on one pixel grid."""
 
     bands: tuple[str, ...]
     """Bands in which objects are measured."""
     detection_bands: tuple[str, ...]
-    """Bands in which they are detected."""
+    """Bands in which objects are detected."""
     method: Literal["median", "peaks"]
-    """median: Source Extractor's on the median of bands; peaks: those of their weighted mean, smoothed with its PSF."""
+    """Detection method. `median`: connected pixels of the median of the bands, as in Source Extractor. `peaks`: peaks
+    of the weighted mean of the bands, smoothed with its PSF."""
     pixel_scale: float
-    """arcsec"""
+    """Pixel scale, arcsec."""
     aperture: float
-    """Radius of aperture photometry, arcsec."""
+    """Radius of the circular apertures, arcsec."""
     electrons_per_njy: Mapping[str, float]
-    """By band: electrons per nJy and unit exposure, which is a second, or the unit of `nimages`; 0 without Poisson
-    noise of the sources."""
+    """Electrons per nJy and unit exposure, by band. The unit is a second, or one exposure if `nimages` gives the
+    exposure of a pixel. 0 leaves out the Poisson noise of the sources."""
     weight_is_exposure_time: bool
-    """True where the exposure of a pixel follows from its weight; False where it is the array `nimages`."""
+    """True if the weight of a pixel is proportional to its exposure time; False if the array `nimages` gives the
+    exposure."""
 
     @abstractmethod
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
-        """Return a window (rows, columns) of arrays of a band.
+        """Return arrays of a band, by name.
 
-        Names: `image` (nJy), `weight` (0 for no data), `noise` (a realisation, nJy), `dq`, `nimages`; and `psf`, which
-        is whole in any window.
+        Parameters
+        ----------
+        band : str
+        names : tuple of str
+            `image` (nJy), `weight` (0 for no data), `noise` (one realisation, nJy), `dq` (data quality), `nimages`
+            (number of exposures) or `psf` (unit flux).
+        window : tuple of slice
+            Rows and columns to return. `psf` is always returned whole.
         """
 
     def measurement(self, band: str) -> MeasurementImage:
-        """Return one band for photometry: three planes in memory while it is made, two in the end."""
+        """Return the measurement image of a band.
+
+        Three images of the field are in memory while it is made, and two afterwards.
+        """
         noise, weight = self.arrays(band, ("noise", "weight")).values()
         rms = rms_of(noise, weight)
         error, mask = errors(weight, rms)
         ratios = noise_ratios(noise, error, mask)
         psf = self.arrays(band, ("psf",))["psf"]
-        spread = psf_fit.scatter(noise, psf, error)
-        # noise and weight are not needed any more: make room for the image
+        psf_ratio = psf_fit.scatter(noise, psf, error)
+        # make room for the image
         del noise, weight
         release_free_memory()
         exposures = None if self.weight_is_exposure_time else self.arrays(band, ("nimages",))["nimages"]
         image = self.arrays(band, ("image",))["image"]
-        return MeasurementImage(image, error, mask, ratios, psf, spread, self.electrons_per_njy[band], rms, exposures)
+        return MeasurementImage(
+            image=image,
+            error=error,
+            mask=mask,
+            aperture_ratios=ratios,
+            psf=psf,
+            psf_ratio=psf_ratio,
+            electrons_per_flux=self.electrons_per_njy[band],
+            rms=rms,
+            exposure_map=exposures,
+        )
 
     def saturated(self, band: str) -> np.ndarray:
-        """True (ny, nx) where a band is saturated."""
+        """Return True, (ny, nx), for the saturated pixels of a band."""
         return (self.arrays(band, ("dq",))["dq"] & SATURATED) > 0
 
     def detection(self) -> MeasurementImage:
-        """Return the detection image: the median of bands, or their mean with inverse variances."""
+        """Return the detection image: the median of the detection bands, or their inverse-variance weighted mean."""
         bands = self.detection_bands
-        scales, spreads = [], []
+        median_weights, rms = [], []
         for band in bands:
             noise, weight = self.arrays(band, ("noise", "weight")).values()
-            spreads.append(rms_of(noise, weight))
-            some = weight[::8, ::8]
-            scales.append(float(np.median(some[some > 0])) if (some > 0).any() else 0.0)
+            rms.append(rms_of(noise, weight))
+            sampled = weight[::8, ::8]
+            median_weights.append(float(np.median(sampled[sampled > 0])) if (sampled > 0).any() else 0.0)
             shape = weight.shape
-            del noise, weight, some
+            del noise, weight, sampled
         image, noise, total = (np.empty(shape, np.float32) for _ in range(3))
-        for part in _blocks(shape):
-            parts = [self.arrays(band, ("image", "noise", "weight"), part) for band in bands]
-            weights = [one["weight"] for one in parts]
+        for window in _windows(shape):
+            planes = [self.arrays(band, ("image", "noise", "weight"), window) for band in bands]
+            weights = [arrays["weight"] for arrays in planes]
             if self.method == "median":
-                image[part], noise[part] = (
-                    median([one[name] for one in parts], weights) for name in ("image", "noise")
+                image[window], noise[window] = (
+                    median([arrays[name] for arrays in planes], weights) for name in ("image", "noise")
                 )
-                total[part] = sum(w / s for w, s in zip(weights, scales, strict=True) if s > 0) / len(bands)
+                # each weight in units of the median weight of its band
+                total[window] = sum(w / m for w, m in zip(weights, median_weights, strict=True) if m > 0) / len(bands)
             else:
-                image[part], total[part] = weighted_mean([one["image"] for one in parts], weights, spreads)
-                noise[part], _ = weighted_mean([one["noise"] for one in parts], weights, spreads)
+                image[window], total[window] = weighted_mean([arrays["image"] for arrays in planes], weights, rms)
+                noise[window], _ = weighted_mean([arrays["noise"] for arrays in planes], weights, rms)
         error, mask = errors(total, rms_of(noise, total))
         psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
         return MeasurementImage(
-            image, error, mask, noise_ratios(noise, error, mask), psf, psf_fit.scatter(noise, psf, error)
+            image=image,
+            error=error,
+            mask=mask,
+            aperture_ratios=noise_ratios(noise, error, mask),
+            psf=psf,
+            psf_ratio=psf_fit.scatter(noise, psf, error),
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class TileField(Field):
-    """One tile of a survey's coadds."""
+    """One tile of a survey's coadds as a field."""
 
     coadds: Coadds
+    """Coadds of the survey."""
     tile: int
-    """Its number."""
+    """Index of the tile."""
     readers: dict[int, Callable[[str, Window], np.ndarray]] = field(default_factory=dict)
-    """By unit, a reader of windows: from the store, or from memory where the tile is not stored."""
+    """Cache of functions that return a window of an array, by index of the unit of the coadds. They read the store, or
+    the memory if the unit is not stored and was made."""
 
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
-        """Return a window (rows, columns) of arrays of a band; of noise the first realisation."""
+        """Return arrays of a band, by name (see `Field.arrays`); `noise` is the first realisation."""
         index = self.coadds.index(self.tile, band)
         if index not in self.readers:
             if self.coadds.has(index):
@@ -132,47 +162,55 @@ class TileField(Field):
                 made = self.coadds.load(index)
                 self.readers[index] = lambda name, part: made[name][(..., *part)].copy()
         windows = {name: {"psf": (), "noise": (slice(0, 1), *window)}.get(name, window) for name in names}
-        found = {name: self.readers[index](name, part) for name, part in windows.items()}
-        return {name: plane[0] if name == "noise" else plane for name, plane in found.items()}
+        arrays = {name: self.readers[index](name, part) for name, part in windows.items()}
+        return {name: array[0] if name == "noise" else array for name, array in arrays.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayField(Field):
-    """Images in memory, made by any program."""
+    """Images in memory, from any program."""
 
     images: Mapping[str, Mapping[str, np.ndarray]]
-    """By band and name, as `arrays` returns them; without `dq` no pixel is saturated."""
+    """Arrays by band and name (see `Field.arrays`). Without `dq`, no pixel is saturated."""
 
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
-        """Return a window (rows, columns) of arrays of a band."""
-        planes = self.images[band]
-        none = np.zeros(planes["image"].shape, np.uint8)
-        found = {name: planes.get(name, none) if name == "dq" else planes[name] for name in names}
-        return {name: plane if name == "psf" else plane[window].copy() for name, plane in found.items()}
+        """Return arrays of a band, by name (see `Field.arrays`)."""
+        images = self.images[band]
+        no_flags = np.zeros(images["image"].shape, np.uint8)
+        arrays = {name: images.get(name, no_flags) if name == "dq" else images[name] for name in names}
+        # copies, because weights are overwritten in place
+        return {name: array if name == "psf" else array[window].copy() for name, array in arrays.items()}
 
 
 def tile_field(coadds: Coadds, tile: int) -> TileField:
-    """Return one tile of a survey's coadds, by its number, as its instrument is measured."""
+    """Return a tile of a survey's coadds as a field, with the bands and the detection method of its instrument.
+
+    Parameters
+    ----------
+    coadds : Coadds
+    tile : int
+        Index of the tile.
+    """
     instrument = coadds.instrument
     drizzled = instrument.coadd == "drizzle"
-    rates = {band: instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT for band in instrument.bands}
+    electrons = {band: instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT for band in instrument.bands}
     if not drizzled:
-        rates = {band: rate * instrument.visit_seconds for band, rate in rates.items()}
+        electrons = {band: rate * instrument.visit_seconds for band, rate in electrons.items()}
     return TileField(
         bands=instrument.bands,
         detection_bands=instrument.detection_bands or instrument.bands,
         method=instrument.detection,
         pixel_scale=instrument.coadd_scale,
         aperture=instrument.aperture,
-        electrons_per_njy=rates,
+        electrons_per_njy=electrons,
         weight_is_exposure_time=drizzled,
         coadds=coadds,
         tile=tile,
     )
 
 
-def _blocks(shape: tuple[int, int]) -> Iterator[Window]:
-    """Yield windows that cover a plane, of whole chunks: none is decoded twice."""
+def _windows(shape: tuple[int, ...]) -> Iterator[Window]:
+    """Yield windows that cover an image (ny, nx) and consist of whole chunks, so that no chunk is decoded twice."""
     height, width = chunk_side(shape[0]), _CHUNKS * chunk_side(shape[1])
     for top in range(0, shape[0], height):
         for left in range(0, shape[1], width):

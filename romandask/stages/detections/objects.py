@@ -1,4 +1,4 @@
-"""Object tables: the detections of all tiles as one HATS catalog, their magnitudes corrected by the zero points."""
+"""Object tables: the objects of all tiles as one HATS catalog, with fluxes corrected by the zero points."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from romandask.stages.detections.zero_points import corrected
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 
 
-def objects(detections: Detections, zero: TableProduct | None = None) -> TableProduct:
-    """Return the object table of a survey: the detections of all tiles, partitioned by HEALPix (HATS).
+def objects(detections: Detections, zero_points: TableProduct | None = None) -> TableProduct:
+    """Return the lazy object table of a survey (schema: catalogs/objects.yaml), a HATS catalog.
 
     Parameters
     ----------
-    zero : offsets of the magnitudes (`zero_points()`), to be taken out; None leaves fluxes as they were measured
+    detections : Detections
+        Detections of the survey; each object of each tile becomes one row.
+    zero_points : TableProduct, optional
+        Offsets of the magnitudes (see `zero_points.zero_points`), which are removed; by default fluxes are left as
+        measured.
     """
     settings = detections.settings
+    # more than half the diagonal of the unique area of a tile, degrees
     radius = detections.coadds.settings.grid().inner / 3600 * 0.75
     cells = detections.region.cells(settings.order)
     tiles_of: dict[int, list[int]] = {int(cell): [] for cell in cells}
@@ -33,14 +38,23 @@ def objects(detections: Detections, zero: TableProduct | None = None) -> TablePr
         Unit(
             f"{settings.order}-{cell}",
             {"order": settings.order, "cell": cell},
-            (*((detections.stage, detections.names[k]) for k in members), *(((zero.stage, "all"),) if zero else ())),
+            (
+                *((detections.stage, detections.names[k]) for k in tiles),
+                *(((zero_points.stage, "all"),) if zero_points else ()),
+            ),
         )
-        for cell, members in tiles_of.items()
+        for cell, tiles in tiles_of.items()
     )
     return TableProduct(
         stage=f"objects/{detections.instrument.name}",
         units=units,
-        make=CollectPartition(detections, tuple(tiles_of), tuple(map(tuple, tiles_of.values())), settings.order, zero),
+        make=CollectPartition(
+            detections=detections,
+            cells=tuple(tiles_of),
+            tiles=tuple(map(tuple, tiles_of.values())),
+            order=settings.order,
+            zero_points=zero_points,
+        ),
         schema=detections.product.tables["objects"],
         pixels=tuple(tiles_of),
         order=settings.order,
@@ -48,30 +62,34 @@ def objects(detections: Detections, zero: TableProduct | None = None) -> TablePr
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CollectPartition:
-    """Makes one HEALPix partition of an object table from the tiles that reach into it."""
+    """Makes one HEALPix partition of an object table from the tiles that overlap it."""
 
     detections: Detections
     cells: tuple[int, ...]
-    members: tuple[tuple[int, ...], ...]
+    """Nested HEALPix cell of each partition."""
+    tiles: tuple[tuple[int, ...], ...]
+    """Indices of the tiles that may overlap each partition."""
     order: int
-    zero: TableProduct | None = None
+    """HEALPix order of the partitions."""
+    zero_points: TableProduct | None = None
+    """Offsets of the magnitudes; None leaves fluxes as measured."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the objects of the partition, by _healpix_29."""
-        parts = [self.detections.objects(k) for k in self.members[index]]
+        """Return the objects of a partition, sorted by _healpix_29."""
+        parts = [self.detections.objects(k) for k in self.tiles[index]]
         shift = 2 * (29 - self.order)
         parts = [part[part["_healpix_29"].to_numpy() >> shift == self.cells[index]] for part in parts]
         filled = [part for part in parts if len(part)]
         if not filled:
             return self.detections.product.tables["objects"].empty_table().to_pandas()
-        found = pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
-        return found if self.zero is None else corrected(found, self.zero.load(0))
+        rows = pd.concat(filled).sort_values(["_healpix_29", "objectId"], ignore_index=True)
+        return rows if self.zero_points is None else corrected(rows, self.zero_points.load(0))
 
 
 def build_objects(context: SurveyContext, survey: str) -> TableProduct:
-    """Return the lazy object table of an instrument."""
+    """Return the lazy object table of a survey (the `build` of the stage)."""
     return objects(context.output(f"detections/{survey}"), context.output(f"zero_points/{survey}"))
 
 
@@ -82,7 +100,8 @@ OBJECTS = Stage(
     reads=("detections", "zero_points"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="HEALPix cell",
-    summary="The objects of all tiles, each once, with DPDD names and calibrated fluxes.",
+    summary="The objects of all tiles in one catalog, each object once, with DPDD column names and fluxes corrected by "
+    "the zero points.",
     sky=("coord_ra", "coord_dec"),
     shrink_with="raise detections.order",
     tables={"objects": "objects/<survey>/"},

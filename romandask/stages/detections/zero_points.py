@@ -1,4 +1,4 @@
-"""Photometric calibration on stars: by how much measured magnitudes differ from true ones, in each band."""
+"""Zero points: the offsets of measured from true magnitudes of stars, in each band and for each kind of flux."""
 
 from __future__ import annotations
 
@@ -15,15 +15,23 @@ from romandask.stages.detections.detections import Detections
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 
 BRIGHT, FAINT = 17.0, 20.0
-"""True magnitudes of the stars that calibrate (Troxel et al. 2023, section 5.3)."""
+"""Range of true magnitudes of the stars that are used (Troxel et al. 2023, section 5.3)."""
 FLUXES = ("kronFlux", "apFlux", "psfFlux")
+"""Kinds of flux, as the columns <band>_<flux> of objects name them."""
 
 
 def zero_points(summary: TableProduct, detections: Detections) -> TableProduct:
-    """Return the lazy offsets of a survey's magnitudes (schema: catalogs/zero_points.yaml): one unit, of all tiles.
+    """Return the lazy zero points of a survey (schema: catalogs/zero_points.yaml), one unit for all tiles.
 
-    Stars that are one object without a flag count: saturated and blended ones do not. A tile that could not be made is
-    left out.
+    Only stars that are the counterpart of exactly one object, without any flag, are used; so saturated and blended
+    stars are not. Tiles that could not be made are left out.
+
+    Parameters
+    ----------
+    summary : TableProduct
+        True objects of each tile (see `truth_match.truth_summary`).
+    detections : Detections
+        Detections of the survey.
     """
     sources = tuple((product.stage, name) for product in (summary, detections) for name in product.names)
     name, bands = detections.instrument.name, detections.instrument.bands
@@ -37,11 +45,19 @@ def zero_points(summary: TableProduct, detections: Detections) -> TableProduct:
 
 
 def offsets(stars: pd.DataFrame, bands: tuple[str, ...]) -> pd.DataFrame:
-    """Return the offset of each band and flux (schema: catalogs/zero_points.yaml).
+    """Return the offset of each band and kind of flux (schema: catalogs/zero_points.yaml).
 
     Parameters
     ----------
-    stars : flux_<band>, true, and <band>_<flux>, measured, nJy
+    stars : DataFrame
+        True fluxes `flux_<band>` and measured fluxes `<band>_<flux>` of stars, nJy.
+    bands : tuple of str
+
+    Returns
+    -------
+    DataFrame
+        `offset` is the median of measured minus true magnitudes, 0 without stars; `error` is the error of the median,
+        from the median absolute deviation.
     """
     rows = []
     for band in bands:
@@ -51,39 +67,48 @@ def offsets(stars: pd.DataFrame, bands: tuple[str, ...]) -> pd.DataFrame:
             difference = (ab_magnitude(stars[f"{band}_{flux}"]) - true)[bright]
             difference = difference[np.isfinite(difference)]
             n = len(difference)
-            middle = float(np.median(difference)) if n else 0.0
-            spread = 1.4826 * np.median(np.abs(difference - middle)) if n > 1 else np.nan
-            # a median's error is a quarter larger than a mean's
-            rows.append((band, flux, n, middle, float(1.2533 * spread / np.sqrt(max(n, 1)))))
+            offset = float(np.median(difference)) if n else 0.0
+            scatter = 1.4826 * np.median(np.abs(difference - offset)) if n > 1 else np.nan
+            # for Gaussian errors, the error of a median is sqrt(pi / 2) = 1.2533 times that of a mean
+            rows.append((band, flux, n, offset, float(1.2533 * scatter / np.sqrt(max(n, 1)))))
     return pd.DataFrame(rows, columns=["band", "flux", "stars", "offset", "error"]).astype({"stars": np.int32})
 
 
-def corrected(objects: pd.DataFrame, found: pd.DataFrame) -> pd.DataFrame:
-    """Return objects whose fluxes and their errors have the offsets taken out."""
+def corrected(objects: pd.DataFrame, zero_points: pd.DataFrame) -> pd.DataFrame:
+    """Return objects with the offsets removed from their fluxes and flux errors.
+
+    Parameters
+    ----------
+    objects : DataFrame
+        Objects (schema: catalogs/objects.yaml).
+    zero_points : DataFrame
+        Offsets (schema: catalogs/zero_points.yaml).
+    """
     scales = {
-        f"{band}_{flux}{ending}": 10 ** (0.4 * offset)
-        for band, flux, offset in zip(found["band"], found["flux"], found["offset"], strict=True)
-        for ending in ("", "Err")
+        f"{band}_{flux}{suffix}": 10 ** (0.4 * offset)
+        for band, flux, offset in zip(zero_points["band"], zero_points["flux"], zero_points["offset"], strict=True)
+        for suffix in ("", "Err")
     }
     return objects.assign(**{name: objects[name] * scale for name, scale in scales.items() if name in objects})
 
 
 @dataclass(frozen=True)
 class MakeZeroPoints:
-    """Makes the offsets of a survey."""
+    """Makes the zero points of a survey."""
 
     summary: TableProduct
     detections: Detections
     bands: tuple[str, ...]
 
     def __call__(self, index: int) -> pd.DataFrame:
-        """Return the offset of each band and flux."""
+        """Return the offset of each band and kind of flux."""
         true = [f"flux_{band}" for band in self.bands]
         measured = [f"{band}_{flux}" for band in self.bands for flux in FLUXES]
         parts = [pd.DataFrame(columns=[*true, *measured], dtype=float)]
-        stored = self.detections.product.store is not None
+        has_store = self.detections.product.store is not None
         for k in range(len(self.detections.units)):
-            if stored and not (self.detections.has(k) and self.summary.has(k)):
+            # the units are optional inputs: with a store, those that failed are missing
+            if has_store and not (self.detections.has(k) and self.summary.has(k)):
                 continue
             summary = self.summary.load(k)
             summary = summary[summary["star"] & (summary["objects"] == 1)]
@@ -102,6 +127,7 @@ ZERO_POINTS = Stage(
     reads=("truth_summary", "detections"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="survey",
-    summary="Median of measured less true magnitudes of stars of 17 to 20 mag, by which fluxes are corrected.",
+    summary="The median of measured minus true magnitudes of stars of 17 to 20 mag, for each band and kind of flux, by "
+    "which the fluxes of objects are corrected.",
     tables={"zero_points": "zero_points/<survey>/"},
 )

@@ -1,4 +1,4 @@
-"""Samples and statistics of blends: objects whose groups, counterparts and light are known."""
+"""Samples and statistics of blends, for objects with known groups, counterparts and fluxes."""
 
 import numpy as np
 import pandas as pd
@@ -14,8 +14,9 @@ from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.blend_statistics import PairSample, Samples, matrix, statistics
+from romandask.stages.analysis.blend_statistics import matrix, statistics
 from romandask.stages.analysis.friends_of_friends import SHIFT, matches
+from romandask.stages.analysis.group_members import PairSample, Samples
 from romandask.stages.analysis.samples import limits, samples
 from romandask.storage.store import Store
 
@@ -32,7 +33,7 @@ def on_sky(frame: pd.DataFrame):
 
 
 def catalog(stage: str, frame: pd.DataFrame, columns: pa.Schema, position=("coord_ra", "coord_dec")) -> TableProduct:
-    """A HATS catalog in memory; columns that the frame has not are zero."""
+    """Return a HATS catalog in memory; missing columns are zero."""
     blank = columns.empty_table().to_pandas()
     full = frame.assign(**{name: np.zeros(len(frame)) for name in blank.columns if name not in frame})
     full = with_spatial_index(full, *position)
@@ -45,7 +46,7 @@ def catalog(stage: str, frame: pd.DataFrame, columns: pa.Schema, position=("coor
 
 
 def survey_of(rows: list[dict], bands: tuple[str, ...], name: str) -> tuple[TableProduct, TableProduct]:
-    """Objects and counterparts: rows have ra, dec (arcsec from the middle), <band> magnitudes, truth_id, flags."""
+    """Return objects and counterparts from rows of x, y (arcsec from the centre), magnitudes, truth_id and flags."""
     frame = pd.DataFrame(rows)
     frame["objectId"] = np.arange(len(frame)) + 1
     columns = {f"{band}_kronFlux": njy(frame[band]) for band in bands} | {f"{band}_extinction": 0.1 for band in bands}
@@ -71,10 +72,10 @@ def _filled(table: pd.DataFrame) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def sky():
-    """Rubin objects 12 arcsec apart, of four kinds: a single, a real blend, a galaxy in two pieces, and one alone."""
+    """Rubin objects 12 arcsec apart: single, real blends, galaxies in two pieces, and without Roman objects."""
     roman, rubin, galaxies = [], [], []
-    places = [(12.0 * i, 12.0 * j) for i in range(-2, 3) for j in range(-2, 3)]
-    for number, (x, y) in enumerate(places):
+    positions = [(12.0 * i, 12.0 * j) for i in range(-2, 3) for j in range(-2, 3)]
+    for number, (x, y) in enumerate(positions):
         kind = number % 4
         number *= 10
         rubin.append(
@@ -97,7 +98,7 @@ def sky():
                 {"x": x - 0.6, "y": y, "H158": 24.1, "F184": 23.0, "truth_id": number + (kind == 1), "flags": 0}
             )
             galaxies.append({"galaxy_id": number + 1, "x": x - 0.6, "y": y, "flux_i": njy(24.0)})
-    # flagged, without a counterpart, and faint: in no clean sample
+    # flagged, without a counterpart, and too faint: not in the clean sample
     roman += [{"x": 3.0, "y": 3.0, "H158": 22.0, "F184": 22.0, "truth_id": 1, "flags": 2}]
     roman += [{"x": 3.0, "y": 5.0, "H158": 22.0, "F184": 22.0, "truth_id": -1, "flags": 0}]
     roman += [{"x": 3.0, "y": 7.0, "H158": 26.0, "F184": 22.0, "truth_id": 1, "flags": 0}]
@@ -115,7 +116,7 @@ def sky():
 
 
 def made(sky, settings: MatchSettings, folder):
-    """Samples and statistics, made stage by stage, each reading the stored one before."""
+    """Make samples and statistics stage by stage; each stage reads the stored products of earlier ones."""
     roman, rubin, truth, stars = sky
     store, tables = Store(folder), {}
 
@@ -129,8 +130,8 @@ def made(sky, settings: MatchSettings, folder):
         limit = stored(limits(*tables_of, settings, band))
         tables[name] = stored(samples(*tables_of, limit, settings, bands, band))
     groups = []
-    for kind in (("matches", {}), ("chance", {"rubin": SHIFT})):
-        groups.append(matches(tables, {"roman": 0, "rubin": 1}, settings, REGION, store, *kind))
+    for prefix, shift in (("matches", {}), ("chance", {"rubin": SHIFT})):
+        groups.append(matches(tables, {"roman": 0, "rubin": 1}, settings, REGION, store, prefix, shift))
         for product in vars(groups[-1]).values():
             stored(product)
     sharp = PairSample(table=tables["roman"], code=0, reference_band="H158", colour_band="F184")
@@ -173,7 +174,7 @@ def test_blends_are_counted_and_those_of_two_true_objects_are_real(cut):
     assert row["rubin_objects"] == 25
     assert row["with_roman"] == 25 - kinds[3]
     assert row["blends"] == kinds[1] + kinds[2]
-    # a galaxy in two pieces is no blend of two galaxies
+    # a galaxy in two pieces is not a blend of two galaxies
     assert row["real"] == kinds[1]
     assert row["alone"] == kinds[3]
     share = row["blends"] / 25
@@ -181,15 +182,15 @@ def test_blends_are_counted_and_those_of_two_true_objects_are_real(cut):
     assert row["error"] == pytest.approx(np.sqrt(share * (1 - share) / 25))
 
 
-def test_moved_objects_meet_by_chance_alone(cut):
-    """They are moved by a little more than their lattice: by 13 arcsec nothing of theirs lies within one."""
+def test_shifted_objects_have_no_chance_links(cut):
+    """The shift of 13 arcsec is a little more than the spacing of the objects, so no pair is within an arcsecond."""
     _, found = cut
     chance = found.chance.all_rows()
     assert chance["rubin_objects"].sum() == 2 * 25
     assert chance["with_roman"].sum() == 0
 
 
-def test_colours_and_sizes_of_blends_are_apart_from_those_of_singles(cut):
+def test_colours_and_sizes_of_blends_and_single_objects(cut):
     _, found = cut
     table = found.distributions.all_rows()
     table = table[np.isclose(table["linking_length"], 1.0)]
@@ -204,7 +205,7 @@ def test_colours_and_sizes_of_blends_are_apart_from_those_of_singles(cut):
 
 @pytest.mark.parametrize("middle", [24.2, 25.1])
 def test_the_limit_is_where_counts_fall_to_four_fifths(middle):
-    """A power law through an error function: known where it falls to 0.8."""
+    """A power law times a logistic completeness, whose magnitude of 80% is known."""
     edges = np.arange(16.0, 30.001, 0.1)
     magnitude = (edges[1:] + edges[:-1]) / 2
     complete = 1 / (1 + np.exp((magnitude - middle) / 0.25))

@@ -1,4 +1,4 @@
-"""Friends of friends against brute force, whatever the partitions."""
+"""Friends of friends against brute force, for several partitions."""
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ REGION = Region(359.99, 0.01, -0.01, 0.01)
 
 
 def brute_force(vectors: np.ndarray, length: float) -> list[set[int]]:
-    """Groups by spreading from object to object over all pairs of angles."""
+    """Return the groups found by following links from object to object, with all pairs of angles."""
     gap = np.degrees(np.arccos(np.clip(vectors @ vectors.T, -1, 1))) * 3600
     near = gap <= length
     left, groups = set(range(len(vectors))), []
@@ -52,7 +52,7 @@ def test_groups_equal_brute_force(seed, count):
     assert len({frozenset(pair) for pair in pairs.tolist()}) == len(pairs), "no pair twice"
     into, joined = forest(count, pairs, gap)
     assert (into <= np.arange(count)).all()
-    # the one forest has the groups of every shorter length
+    # the groups of every shorter length follow from the same forest
     for length in (1.0, 0.6, 0.25):
         found = label(into, joined, length)
         assert as_sets(found) == {frozenset(group) for group in brute_force(vectors, length)}
@@ -69,7 +69,7 @@ def test_a_link_is_an_angle_not_a_difference_of_coordinates():
 
 
 def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
-    """An object table of HEALPix partitions of any order."""
+    """Return an object table with HEALPix partitions of any order."""
     columns = schema("objects", ("i",))
     blank = columns.empty_table().to_pandas()
     missing = {name: np.full(len(frame), "" if name == "tile" else 0) for name in blank.columns if name not in frame}
@@ -93,10 +93,10 @@ def codes_of(products) -> dict[str, int]:
     return {name: code for code, name in enumerate(products)}
 
 
-def stored_matches(products, settings: MatchSettings, folder, kind: str = "matches", **shift: float) -> Matches:
-    """Groups made stage by stage, each reading the stored one before."""
+def stored_matches(products, settings: MatchSettings, folder, prefix: str = "matches", **shift: float) -> Matches:
+    """Make groups stage by stage; each stage reads the stored products of earlier ones."""
     store = Store(folder)
-    made = matches(products, codes_of(products), settings, REGION, store, kind, shift)
+    made = matches(products, codes_of(products), settings, REGION, store, prefix, shift)
     for product in (made.local, made.crossing, made.merged, made.groups):
         tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
         assert all(outcome.record for outcome in InProcess().run(Batch(product, tasks, store)))
@@ -146,8 +146,8 @@ def test_groups_do_not_depend_on_partitions(clumped, object_order, match_order, 
         assert as_sets(group) == {frozenset(group) for group in brute_force(vectors, length)}
 
 
-def test_a_moved_survey_keeps_its_own_groups_and_loses_those_with_the_other(clumped, tmp_path):
-    """Moved by more than a clump is wide, pairs are those of the moved positions: brute force says which."""
+def test_groups_of_a_shifted_survey_equal_brute_force(clumped, tmp_path):
+    """The shift is larger than a clump; links are those of the shifted positions."""
     roman, rubin = clumped
     products = {"roman": table("roman", roman, 11), "rubin": table("rubin", rubin, 11)}
     made = stored_matches(products, MatchSettings(order=12), tmp_path, "chance", rubin=SHIFT)
@@ -170,7 +170,7 @@ def test_no_objects_are_no_groups(tmp_path):
     assert len(made.groups.all_rows()) == 0
 
 
-def test_links_longer_than_what_is_looked_at_around_a_partition_are_refused():
+def test_links_longer_than_the_ring_around_a_partition_are_refused():
     products = {"roman": table("roman", pd.DataFrame({"objectId": [1], "coord_ra": [0.0], "coord_dec": [0.0]}), 10)}
     with pytest.raises(UserError, match=r"linking_lengths: 60 arcsec, 5 at most"):
         matches(products, codes_of(products), MatchSettings(linking_lengths=(60.0,), order=12), REGION)

@@ -18,15 +18,8 @@ from romandask.model.sky import Region
 from romandask.products.hats import with_spatial_index
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
-from romandask.stages.analysis.shear import (
-    MeasureShapes,
-    lensing,
-    pair_sums,
-    patches,
-    separations,
-    significance,
-    two_point,
-)
+from romandask.stages.analysis.shear import MeasureShapes, lensing
+from romandask.stages.analysis.two_point import pair_sums, patches, separations, significance, two_point
 
 COSMO = Cosmology()
 ARCMIN = np.radians(1 / 60)
@@ -104,13 +97,13 @@ def test_shape_noise_alone_is_two_sigma_to_the_fourth_over_pairs():
 
 
 def test_sample_variance_is_that_of_gaussian_fields(power):
-    """Periodic Gaussian fields without noise: xi+ by the transform, averaged over annuli, from field to field."""
+    """The scatter of xi+ between periodic Gaussian fields without noise, averaged over annuli."""
     random = np.random.default_rng(7)
     n, side = 256, np.radians(10.0)
     step = side / n
     wave = 2 * np.pi * np.fft.fftfreq(n, step)
     ell = np.hypot(wave[:, None], wave[None, :])
-    # of a smoothed field without waves as long as itself, so that neither its pixels nor its few longest waves matter
+    # smoothed, and without the longest waves, so that neither pixels nor the few longest modes matter
     smooth = power * np.exp(-((ELL * 3 * step) ** 2) / 2) * (1 - np.exp(-((ELL / 250) ** 4)))
     spectrum = np.interp(ell, ELL, smooth, left=0)
     spectrum[0, 0] = 0
@@ -165,8 +158,8 @@ def test_a_region_smaller_than_the_shortest_separation_has_no_bins():
     assert significance(table) == 0
 
 
-def test_the_sample_is_the_galaxies_that_objects_have_as_counterparts(small):
-    """Each once, whatever the number of its pieces; no star of the same number."""
+def test_shapes_are_those_of_galaxies_that_are_counterparts(small):
+    """Each galaxy is one row, also with several objects; a star with the same id is left out."""
     every = small.truth.galaxies.all_rows()
     some = every.iloc[::3]
     ids = np.concatenate([some["galaxy_id"], some["galaxy_id"][:5], every["galaxy_id"].iloc[[1]], [-1]])
@@ -201,7 +194,7 @@ def test_the_sample_is_the_galaxies_that_objects_have_as_counterparts(small):
 
 
 def random_shapes(region: Region, count: int) -> pd.DataFrame:
-    """Return galaxies with shapes that are alike near one another."""
+    """Return galaxies with spatially correlated shapes."""
     random = np.random.default_rng(3)
     ra = (region.ra_min + random.uniform(0, region.width, count)) % 360
     dec = np.degrees(np.arcsin(random.uniform(*np.sin(np.radians([region.dec_min, region.dec_max])), count)))
@@ -249,8 +242,8 @@ def test_sums_over_patches_are_treecorrs_of_the_whole_with_its_jackknife(ra):
     np.testing.assert_allclose(table["xim_jackknife"], errors[len(table) :], rtol=1e-9)
 
 
-def test_stages_over_partitions_make_what_is_made_in_memory():
-    """Shapes that lie in HEALPix partitions, counted patch by patch."""
+def test_stages_over_partitions_equal_the_computation_in_memory():
+    """Shapes are in HEALPix partitions and counted patch by patch."""
     region = Region(52.0, 53.0, -40.6, -40.0)
     frame = with_spatial_index(random_shapes(region, 3000)).assign(galaxy_id=np.arange(3000))
     settings, order = LensingSettings(max_separation=15, bins=4, patches=6), 6
@@ -275,7 +268,7 @@ def test_stages_over_partitions_make_what_is_made_in_memory():
 
 
 def test_pairs_are_counted_by_one_thread_and_treecorr_is_left_as_it_was():
-    """Workers are the parallelism; threads of one would wait for those of another."""
+    """Workers run in parallel, so threads within one would only compete with the others."""
     treecorr.util.set_omp_threads(4)
     random = np.random.default_rng(1)
     rows = pd.DataFrame({name: random.uniform(0, 0.3, 500) for name in ("ra", "dec", "g1", "g2")})

@@ -1,4 +1,4 @@
-"""Depths and residuals of made-up objects whose noise is known, and the dust of the Milky Way in a band."""
+"""Depths and residuals of simulated objects with known noise, and Milky Way extinction in a band."""
 
 import galsim
 import numpy as np
@@ -13,9 +13,9 @@ from romandask.report import figures
 from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth
 
 SIGMA = 20.0
-"""Noise of every flux, nJy."""
+"""Rms noise of every flux, nJy."""
 OFFSET = 0.1
-"""Measured magnitudes are too bright by this."""
+"""Magnitudes by which measured fluxes are too bright."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_residuals_are_the_offset_and_the_noise_that_went_in(joined):
         # half a bin of magnitude changes a flux by a quarter
         assert row["scatter"] == pytest.approx(1.0857 * SIGMA / flux / 10 ** (0.4 * OFFSET), rel=0.3)
         assert row["pull"] == pytest.approx(flux * (10 ** (0.4 * OFFSET) - 1) / SIGMA, rel=0.1, abs=0.1)
-    # an offset in magnitudes spreads pulls of bright objects; those of faint ones are the noise alone
+    # the pulls of faint objects are those of the noise; an offset in magnitude widens those of bright objects
     faint = table[table["magnitude"] > 25]
     assert faint["pull_scatter"].to_numpy() == pytest.approx(1, abs=0.07)
 

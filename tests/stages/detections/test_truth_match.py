@@ -1,4 +1,4 @@
-"""Counterparts among the true objects, against a loop over all pairs, and what was found of the truth."""
+"""Counterparts against a loop over all pairs, and completeness and purity."""
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ ARCSEC = np.pi / 180 / 3600
 
 
 def crowd(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places and magnitudes of objects on six square arcseconds at the pole of RA, where it wraps."""
+    """Return unit vectors and magnitudes of objects in a square of 6 arcsec around RA 0, where RA wraps."""
     random = np.random.default_rng(seed)
     ra, dec = random.uniform(-3, 3, count) / 3600, random.uniform(-3, 3, count) / 3600
     return unit_vectors(ra % 360, dec), random.uniform(20, 26, count)
@@ -23,8 +23,8 @@ def test_counterparts_are_those_of_a_loop_over_all_pairs():
     magnitude[5], true_magnitude[7] = np.nan, np.nan
     found = counterparts(measured, magnitude, true, true_magnitude, ARCSEC)
     alone = 0
-    for n, place in enumerate(measured):
-        distance = np.arccos(np.clip(true @ place, -1, 1))
+    for n, vector in enumerate(measured):
+        distance = np.arccos(np.clip(true @ vector, -1, 1))
         near = [k for k in np.argsort(distance)[:NEIGHBOURS] if distance[k] <= ARCSEC]
         assert found.candidates[n] == len(near)
         if not near:
@@ -40,11 +40,11 @@ def test_counterparts_are_those_of_a_loop_over_all_pairs():
     assert (found.candidates == NEIGHBOURS).any()
 
 
-def test_nothing_has_no_counterparts():
-    places, magnitude = crowd(4, 3)
+def test_empty_catalogs_have_no_counterparts():
+    vectors, magnitude = crowd(4, 3)
     nothing = np.empty((0, 3)), np.empty(0)
-    assert (counterparts(places, magnitude, *nothing, ARCSEC).row == -1).all()
-    assert len(counterparts(*nothing, places, magnitude, ARCSEC).row) == 0
+    assert (counterparts(vectors, magnitude, *nothing, ARCSEC).row == -1).all()
+    assert len(counterparts(*nothing, vectors, magnitude, ARCSEC).row) == 0
 
 
 def test_completeness_counts_true_and_purity_measured_objects():

@@ -1,4 +1,4 @@
-"""Offsets of magnitudes from stars whose true ones are known."""
+"""Zero points from stars with known true magnitudes."""
 
 import numpy as np
 import pandas as pd
@@ -8,7 +8,7 @@ from romandask.stages.detections.zero_points import FLUXES, corrected, offsets
 
 
 def stars(count: int, dimming: float, scatter: float) -> pd.DataFrame:
-    """Return stars of 15 to 22 mag in one band whose measured fluxes are too faint by some magnitudes."""
+    """Return stars of 15 to 22 mag in one band whose measured fluxes are too faint by `dimming` magnitudes."""
     random = np.random.default_rng(4)
     true = 10 ** ((31.4 - random.uniform(15, 22, count)) / 2.5)
     columns = {"flux_H158": true}
@@ -19,7 +19,7 @@ def stars(count: int, dimming: float, scatter: float) -> pd.DataFrame:
 
 def test_offsets_are_the_medians_of_stars_in_the_range_and_are_taken_out():
     table = stars(4000, 0.2, 0.05)
-    # saturated and faint stars lie elsewhere, and do not count; nor does one without light
+    # saturated and faint stars have other offsets and are not used, nor is a star without flux
     outside = (table["flux_H158"] > 10 ** ((31.4 - 17) / 2.5)) | (table["flux_H158"] <= 10 ** ((31.4 - 20) / 2.5))
     table.loc[outside, "H158_kronFlux"] *= 0.3
     table.loc[table.index[~outside][0], "H158_kronFlux"] = -1.0

@@ -127,7 +127,7 @@ def test_workers_that_die_before_they_begin_are_started_again(monkeypatch):
     with runner(1, 1.5) as execution:
         assert "1 local workers" in execution.description
     assert starts == [1, 1, 1]
-    monkeypatch.setattr(clients, "STARTS", 2)
+    monkeypatch.setattr(clients, "START_ATTEMPTS", 2)
     starts.clear()
     with pytest.raises(UserError, match="Nanny failed to start"), runner(1, 1.5):
         pass

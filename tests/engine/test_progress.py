@@ -24,9 +24,9 @@ from romandask.survey import Survey
 def test_what_is_left_goes_by_cost_not_by_number():
     """The dear units go first: after one of four, with nine tenths of the cost, a tenth is left."""
     pace = Pace(units=4, cost=10.0, start=100.0)
-    assert pace.left() is None
+    assert pace.seconds_left() is None
     pace.advance(9.0, now=190.0)
-    assert pace.left() == pytest.approx(10.0)
+    assert pace.seconds_left() == pytest.approx(10.0)
     assert "1/4 units  90.0 s, about 10 s left" in pace.text("coadds/roman", 190.0)
     for _ in range(3):
         pace.advance(1 / 3, now=200.0)
@@ -38,11 +38,11 @@ def test_what_is_left_does_not_count_the_time_that_others_had_the_workers():
     pace = Pace(units=10, cost=10.0, start=100.0)
     pace.advance(1.0, now=102.0, seconds=2.0)
     pace.advance(1.0, now=700.0, seconds=2.0)
-    assert pace.left() == pytest.approx(16.0)
+    assert pace.seconds_left() == pytest.approx(16.0)
     # two workers: the next ones end a second after one another
     for now in (701.0, 702.0):
         pace.advance(1.0, now=now, seconds=2.0)
-    assert pace.left() == pytest.approx(9.0)
+    assert pace.seconds_left() == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(3.2, "3 s"), (89, "89 s"), (600, "10 min"), (9000, "2.5 h")])
@@ -70,13 +70,13 @@ class Since:
 
 
 def test_what_takes_long_says_that_it_goes_on(monkeypatch):
-    monkeypatch.setattr(progress, "QUIET", 0.3)
+    monkeypatch.setattr(progress, "MAX_SILENCE", 0.3)
     console = Console(file=io.StringIO(), width=200)
     start = time.monotonic()
     with Reporter(console).busy("planning"):
         wait_for("planning: ", console)
     lines = console.file.getvalue().splitlines()
-    assert 1 <= len(lines) <= 1 + (time.monotonic() - start) / progress.QUIET, "no oftener than it should"
+    assert 1 <= len(lines) <= 1 + (time.monotonic() - start) / progress.MAX_SILENCE, "no oftener than it should"
     assert all(line.startswith("planning: ") for line in lines)
 
 
@@ -96,7 +96,7 @@ def test_commands_that_take_long_say_that_they_go_on(words, module, text, monkey
         assert said.wait(60), "nothing was said in a minute"
         return Survey(settings)
 
-    monkeypatch.setattr(progress, "QUIET", 0.2)
+    monkeypatch.setattr(progress, "MAX_SILENCE", 0.2)
     monkeypatch.setattr(progress.Reporter, "say", saying)
     monkeypatch.setattr(module, "Survey", held)
     monkeypatch.setattr(sys, "argv", ["romandask", *words])
@@ -108,7 +108,7 @@ def test_commands_that_take_long_say_that_they_go_on(words, module, text, monkey
 
 
 def test_stages_without_a_finished_unit_say_that_they_go_on(monkeypatch):
-    monkeypatch.setattr(progress, "QUIET", 0.3)
+    monkeypatch.setattr(progress, "MAX_SILENCE", 0.3)
     console = Console(file=io.StringIO(), width=200)
     with Reporter(console).board() as board:
         meter, other = board.begin("coadds/roman", 2, 3.0), board.begin("truth_index/roman", 3, 3.0)

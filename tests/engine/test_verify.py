@@ -15,7 +15,7 @@ import yaml
 from conftest import MINI, command
 
 from romandask.cli.main import main
-from romandask.engine.verify import BESIDE
+from romandask.engine.verify import OTHER_FILES
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
 from romandask.run import verify_store
@@ -65,7 +65,7 @@ def test_a_store_is_as_it_was_written(store):
     assert "units are as they were written" in done.stdout
     every = {stage_of(store, path) for path in stored(store)}
     known = {found.stage for found in verify_store(open_survey(store))}
-    assert every <= known | set(BESIDE)
+    assert every <= known | set(OTHER_FILES)
     assert {"exposures/roman", "coadds/rubin", "truth/galaxies_margin", "matches/groups"} <= every
 
 

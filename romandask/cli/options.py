@@ -1,4 +1,4 @@
-"""Arguments that several commands have, and what they do alike."""
+"""Arguments and behaviour that several commands share."""
 
 from __future__ import annotations
 
@@ -12,38 +12,51 @@ import typer
 from romandask.storage.paths import AnyPath, parse_path
 
 
-def source_place(text: str) -> AnyPath:
-    """Return the place of something that is read."""
+def source_path(text: str) -> AnyPath:
+    """Return the path of an input."""
     return parse_path(text, "a source")
 
 
-Source = Annotated[
-    str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
-]
+Source = Annotated[str, typer.Argument(metavar="PIPELINE", help="YAML file, or name of a pipeline of the package.")]
 Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
+    list[str] | None,
+    typer.Argument(metavar="KEY=VALUE", help="Settings that override the pipeline, for example coadds.pixfrac=0.8."),
 ]
 StoreOption = Annotated[
     Any,
     typer.Option("--store", metavar="FOLDER", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER."),
 ]
-Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", min=0, help="Number of local worker processes; 0 runs everything in this process."),
+]
 Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
+    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, for example tcp://host:8786.")
 ]
 StoreArgument = Annotated[
     Any, typer.Argument(metavar="STORE", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER.")
 ]
 Spectra = Annotated[
     Any,
-    typer.Option("--seds", parser=source_place, help="Folder of the spectra that are named; default: seds beside SRC."),
+    typer.Option(
+        "--seds",
+        metavar="FOLDER",
+        parser=source_path,
+        help="Folder of the spectra that the catalog names; default: seds in the folder of the catalog.",
+    ),
 ]
-Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
+Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions of the catalogs.")]
 
 
 @contextmanager
 def resumable(text: str = "stopped; the same command resumes") -> Iterator[None]:
-    """Turn an interrupt into one line: what is stored stays, and the same command goes on from there."""
+    """Turn Ctrl-C into one line on standard error and exit code 130.
+
+    Parameters
+    ----------
+    text : str
+        The line. Stored units stay, so the same command resumes.
+    """
     try:
         yield
     except KeyboardInterrupt:

@@ -154,7 +154,7 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
     assert "Traceback" in reason.read_text()
     again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
     assert again.returncode == 1
-    assert f"failed: coadds/roman/{reason.stem} (set aside, it failed before)" in again.stdout
+    assert f"failed: coadds/roman/{reason.stem} (skipped, it failed before)" in again.stdout
     assert "--retry-failed" in again.stdout
     assert reason.stat().st_mtime_ns == written
     assert command("verify", str(tmp_path / "s"), "--forget").returncode == 1

@@ -1,1 +1,1 @@
-"""The command line: arguments and messages; what a command does is in the rooms below."""
+"""Command line: arguments and messages. The lower layers of the package do the work."""

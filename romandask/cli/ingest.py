@@ -1,4 +1,4 @@
-"""Commands that bring real catalogs into a store."""
+"""Commands that convert real catalogs into the truth catalogs of a store."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from romandask import run as running
-from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_place
+from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_path
 from romandask.engine.clients import runner
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
@@ -18,34 +18,37 @@ from romandask.storage.paths import AnyPath, resolve_below
 from romandask.storage.store import Store
 from romandask.survey import Survey
 
-ingest_app = typer.Typer(no_args_is_help=True, help="Bring a real catalog into a store.")
+ingest_app = typer.Typer(no_args_is_help=True, help="Convert a real catalog into the truth catalogs of a store.")
 
 
 @ingest_app.command()
 def skycatalogs(
     source: Annotated[
-        Any, typer.Argument(metavar="SRC", parser=source_place, help="Folder of skyCatalogs files, or its YAML.")
+        Any, typer.Argument(metavar="SRC", parser=source_path, help="Folder of skyCatalogs files, or its YAML file.")
     ],
     store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
     workers: Workers = 0,
 ) -> None:
-    """Bring skyCatalogs in as HATS catalogs, with fluxes in all ten bands; bad rows go to quarantine."""
+    """Convert skyCatalogs to HATS catalogs with fluxes in all ten bands; invalid rows are quarantined."""
     _ingest(source, {"source": "skycatalogs", "path": str(source)}, store, seds, order, workers)
 
 
 @ingest_app.command("instance-catalog")
 def instance_catalog(
     source: Annotated[
-        Any, typer.Argument(metavar="SRC", parser=source_place, help="A phoSim instance catalog or .gz.")
+        Any, typer.Argument(metavar="SRC", parser=source_path, help="phoSim instance catalog, plain or .gz.")
     ],
     store: StoreOption,
     seds: Spectra = None,
     order: Order = 5,
     workers: Workers = 0,
 ) -> None:
-    """Bring a DC2 instance catalog in: components of one galaxy become one row, shears are given the on-sky sign."""
+    """Convert a DC2 instance catalog.
+
+    The components of a galaxy become one row, and shears get the on-sky sign convention.
+    """
     _ingest(source, {"source": "instance_catalog", "path": str(source)}, store, seds, order, workers)
 
 
@@ -55,8 +58,8 @@ def table(
         Any,
         typer.Argument(
             metavar="MAP",
-            parser=source_place,
-            help="YAML with sections galaxies and stars, each with path and columns (ours: the file's).",
+            parser=source_path,
+            help="YAML file with sections galaxies and stars, each with a path and columns (our name: file's name).",
         ),
     ],
     store: StoreOption,
@@ -64,7 +67,7 @@ def table(
     order: Order = 5,
     workers: Workers = 0,
 ) -> None:
-    """Bring Parquet or FITS tables in, with a map of their columns."""
+    """Convert Parquet or FITS tables, with a map of their columns."""
     sections = read_yaml(columns)
     unknown = sorted(set(sections) - {"galaxies", "stars"})
     if unknown or not sections:
@@ -72,7 +75,7 @@ def table(
     content: dict[str, Any] = {"source": "table"}
     for section, key in (("galaxies", "galaxy_table"), ("stars", "star_table")):
         if isinstance(sections.get(section), dict) and "path" in sections[section]:
-            # as the map's author sees it
+            # relative to the folder of the map
             path = resolve_below(columns.parent, str(sections[section]["path"]))
             content[key] = sections[section] | {"path": str(path)}
         elif section in sections:
@@ -92,7 +95,7 @@ def _ingest(
     }
     settings = pipeline_of(content, str(source))
     survey = Survey(settings, Store(store))
-    # opened before anything is written, so that a wrong source is reported first
+    # opened before anything is written, so that an invalid source leaves no store behind
     survey.output("truth/ingested")
     Store(store).prepare()
     reporter = Reporter(Console())

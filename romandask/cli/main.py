@@ -1,4 +1,4 @@
-"""The command line: no logic of its own. A user's mistake is one line and exit code 2."""
+"""Main commands of the command line. A mistake of the user ends with one line on standard error and exit code 2."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ import warnings
 from pathlib import Path
 from typing import Annotated
 
-# one thread a process: the workers are the parallelism
+# one thread per process, because the workers are the parallelism; set before the libraries are imported
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.live import Live  # noqa: E402
-from rich.table import Column, Table  # noqa: E402
+from rich.table import Table  # noqa: E402
 
+from romandask import __version__  # noqa: E402
 from romandask import run as running  # noqa: E402
 from romandask.cli.calibration import calibration_app  # noqa: E402
 from romandask.cli.export import export_app  # noqa: E402
 from romandask.cli.ingest import ingest_app  # noqa: E402
 from romandask.cli.options import Scheduler, StoreOption, Workers, resumable  # noqa: E402
+from romandask.cli.plan_table import print_plan  # noqa: E402
 from romandask.engine.clients import runner  # noqa: E402
 from romandask.engine.progress import Reporter, busy, duration  # noqa: E402
 from romandask.export import sha256sums  # noqa: E402
@@ -31,8 +33,8 @@ from romandask.export.options import Overrides, Source, StoreArgument  # noqa: E
 from romandask.model.errors import UserError  # noqa: E402
 from romandask.pipeline import load_pipeline  # noqa: E402
 from romandask.report.page import write_report  # noqa: E402
-from romandask.report.reference import reference as data_products  # noqa: E402
-from romandask.report.stage_diagram import dag_svg  # noqa: E402
+from romandask.report.reference import reference as data_product_reference  # noqa: E402
+from romandask.report.stage_diagram import write_stage_diagram  # noqa: E402
 from romandask.stage_graph import Selection, stage_products  # noqa: E402
 from romandask.stages.coadds.pixfrac import advice, coverage  # noqa: E402
 from romandask.storage.lock import in_use  # noqa: E402
@@ -40,61 +42,62 @@ from romandask.storage.store import FULL, Store  # noqa: E402
 from romandask.survey import Survey, open_survey  # noqa: E402
 
 app = typer.Typer(
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     no_args_is_help=True,
-    help="A joint Roman and Rubin synthetic sky survey.",
 )
 app.add_typer(ingest_app, name="ingest")
 app.add_typer(export_app, name="export")
 app.add_typer(calibration_app, name="calibration")
-WATCHED = 3.0
-"""Seconds between two looks at a store that is watched."""
+WATCH_INTERVAL = 3.0
+"""Time between two updates of `status --watch`, s."""
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"romandask {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Make and read a joint synthetic sky survey of Roman and Rubin."""
 
 
 @app.command()
 def plan(
     pipeline: Source,
     overrides: Overrides = None,
-    dag: Annotated[Path | None, typer.Option("--dag", help="Write the stages as an SVG picture to this file.")] = None,
+    dag: Annotated[Path | None, typer.Option("--dag", help="Write a diagram of the stages to this SVG file.")] = None,
 ) -> None:
-    """Show units, bytes and peak memory of every stage; write nothing."""
+    """Show the units, image bytes, core hours and worker memory of every stage, without making anything."""
     settings = load_pipeline(pipeline, overrides)
     with busy("planning"):
         survey = Survey(settings)
         rows = running.plan(survey)
-    table = Table(Column("stage", no_wrap=True), "units", "image bytes", "core hours", "worker memory")
-    for row in rows:
-        size = f"{row.bytes / 1e9:.2f} GB" if row.bytes else "-"
-        hours = f"{row.hours:.2f}" if row.hours else "-"
-        table.add_row(row.stage, str(row.units), size, hours, f"{row.memory / 2**30:.2f} GiB")
-    total = sum(row.units for row in rows)
-    table.add_row(
-        "total",
-        str(total),
-        f"{sum(row.bytes for row in rows) / 1e9:.2f} GB",
-        f"{sum(row.hours for row in rows):.2f}",
-        f"limit {settings.run.memory_limit:.2f} GiB",
-    )
-    Console().print(table)
+    print_plan(rows, settings.run.memory_limit, Console())
     if dag is not None:
         with busy("drawing the stages"):
-            dag_svg(survey, rows, dag)
+            write_stage_diagram(survey, rows, dag)
         Console().print(f"wrote {dag}", highlight=False)
 
 
 @app.command()
 def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
-    """Show what each pixfrac does to the coadds of Roman's dithers, and recommend one; make nothing."""
+    """Compare values of coadds.pixfrac on the Roman dithers and recommend one, without making anything."""
     with busy("drizzling weights"):
         survey = Survey(load_pipeline(pipeline, overrides))
-        found = coverage(survey.output(f"coadds/{survey.sharpest}"))
+        rows = coverage(survey.output(f"coadds/{survey.sharpest}"))
     table = Table("band", "exposures", "pixfrac", "empty pixels", "rms / median of weight", "")
-    for one in found:
-        cells = (str(one.exposures), f"{one.pixfrac:.1f}", f"{one.empty:.2%}", f"{one.uneven:.3f}")
-        table.add_row(one.band, *cells, "good" if one.good else "")
+    for row in rows:
+        cells = (str(row.exposures), f"{row.pixfrac:.1f}", f"{row.empty:.2%}", f"{row.uneven:.3f}")
+        table.add_row(row.band, *cells, "good" if row.good else "")
     Console().print(table)
-    best = advice(found)
+    best = advice(rows)
     text = "none is good in all bands: more exposures are needed" if best is None else f"coadds.pixfrac={best:g}"
     Console().print(text, highlight=False)
 
@@ -107,18 +110,23 @@ def run(
     workers: Workers = None,
     scheduler: Scheduler = None,
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="A stage alone, coadds or coadds/roman; may be repeated.")
+        list[str] | None,
+        typer.Option("--only", help="Run only this stage, for example coadds or coadds/roman; may be repeated."),
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", help="This stage and those after it in the plan.")] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", help="Run this stage and the stages after it in the plan.")
+    ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say which units would be made and why, and make none.")
+        bool, typer.Option("--dry-run", help="Show which units would be made and why, without making them.")
     ] = False,
-    explain: Annotated[bool, typer.Option("--explain", help="Say why units are made, then make them.")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Show which units will be made and why, then make them.")
+    ] = False,
     retry: Annotated[
-        bool, typer.Option("--retry-failed", help="Make again what failed before and was set aside.")
+        bool, typer.Option("--retry-failed", help="Also make the units that failed in an earlier run.")
     ] = False,
 ) -> None:
-    """Make and store everything that is missing, then the report. The same command resumes."""
+    """Make and store all missing and outdated units, then write the report. The same command resumes a run."""
     survey = Survey(load_pipeline(pipeline, overrides), Store(store))
     settings, reporter = survey.pipeline, Reporter(Console())
     selection = Selection(tuple(only or ()), start)
@@ -130,7 +138,7 @@ def run(
             _explain(survey, selection, retry, reporter)
     if dry_run:
         return
-    began = time.monotonic()
+    start_time = time.monotonic()
     count = settings.run.workers if workers is None else workers
     with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
         Store(store).prepare()
@@ -142,9 +150,9 @@ def run(
     if made == 0 and not summary.failed:
         reporter.say(f"nothing to do: all {kept} units of {store} are done")
     else:
-        reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - began:.0f} s")
-    for text, count in summary.warnings.most_common():
-        reporter.say(f"warning of {count} units: {text}")
+        reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - start_time:.0f} s")
+    for text, units in summary.warnings.most_common():
+        reporter.say(f"warning of {units} units: {text}")
     for name in summary.failed:
         reporter.say(f"failed: {name}")
     if summary.failed:
@@ -162,7 +170,7 @@ def run(
 def _explain(survey: Survey, selection: Selection, retry: bool, reporter: Reporter) -> None:
     for row in running.explain(survey, selection, retry):
         if row.made or row.reasons:
-            reasons = ", ".join(f"{count} {why}" for why, count in row.reasons.items())
+            reasons = ", ".join(f"{count} {reason}" for reason, count in row.reasons.items())
             reporter.say(f"{row.stage:22s} make {row.made}, keep {row.kept}: {reasons}")
     reporter.say("every other unit is kept")
 
@@ -170,9 +178,9 @@ def _explain(survey: Survey, selection: Selection, retry: bool, reporter: Report
 @app.command()
 def status(
     store: StoreArgument,
-    watch: Annotated[bool, typer.Option("--watch", help="Show it again and again while a run goes on.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Update the table until the run in progress ends.")] = False,
 ) -> None:
-    """Show units done, missing and failed, a line a stage, and what the newest run did last."""
+    """Show the units done, missing and failed of each stage, and the last event of the newest run."""
     with busy("looking at the store"):
         survey = open_survey(store)
         table = _status(survey)
@@ -181,7 +189,7 @@ def status(
         return
     with resumable("no longer watched; the run goes on"), Live(table, auto_refresh=False) as live:
         while in_use(store):
-            time.sleep(WATCHED)
+            time.sleep(WATCH_INTERVAL)
             live.update(_status(survey), refresh=True)
 
 
@@ -199,13 +207,16 @@ def _status(survey: Survey) -> Table:
 @app.command()
 def verify(
     store: StoreArgument,
-    only: Annotated[str | None, typer.Option("--only", help="A stage, for example coadds/roman.")] = None,
+    only: Annotated[
+        str | None, typer.Option("--only", help="Verify only this stage, for example coadds/roman.")
+    ] = None,
     forget: Annotated[
-        bool, typer.Option("--forget", help="Remove the records of what is damaged: the next run makes it anew.")
+        bool,
+        typer.Option("--forget", help="Remove the records of damaged units, so that the next run makes them again."),
     ] = False,
 ) -> None:
-    """Read every stored byte and compare it with what the manifest says was written; exported files too."""
-    # files may have been exported into the folder of a store, which then is what is meant
+    """Compare every stored byte of a store, or of a folder of exported files, with its recorded hash."""
+    # a folder with both a store and exported files counts as a store
     if isinstance(store, Path) and (store / sha256sums.NAME).is_file() and not (store / "pipeline.yaml").exists():
         if only or forget:
             raise UserError(f"{store}: exported files have no stages and no records: verify them without options")
@@ -214,12 +225,12 @@ def verify(
     units = damaged = 0
     with busy("reading every byte"):
         survey = open_survey(store)
-        for found in running.verify_store(survey, only):
-            units, damaged = units + found.units, damaged + len(found.damaged)
-            for name, why in found.damaged:
-                print(f"damaged: {found.stage}/{name}: {why}")
-            if forget and found.damaged:
-                running.forget_damaged(survey, found)
+        for result in running.verify_store(survey, only):
+            units, damaged = units + result.units, damaged + len(result.damaged)
+            for name, damage in result.damaged:
+                print(f"damaged: {result.stage}/{name}: {damage}")
+            if forget and result.damaged:
+                running.forget_damaged(survey, result)
     if damaged:
         print(
             f"{damaged} damaged: " + ("run again, they are made anew" if forget else "verify --forget, then run again")
@@ -230,19 +241,19 @@ def verify(
 
 def _verify_files(folder: Path) -> None:
     with busy("reading every byte"):
-        found = list(sha256sums.check(folder))
-    damaged = [(name, why) for name, why in found if why]
-    for name, why in damaged:
-        print(f"damaged: {folder / name}: {why}")
+        checked = list(sha256sums.check(folder))
+    damaged = [(name, damage) for name, damage in checked if damage]
+    for name, damage in damaged:
+        print(f"damaged: {folder / name}: {damage}")
     if damaged:
         print(f"{len(damaged)} damaged: export them again")
         raise typer.Exit(1)
-    print(f"{folder}: {len(found)} files are as they were written")
+    print(f"{folder}: {len(checked)} files are as they were written")
 
 
 @app.command()
 def report(store: StoreArgument) -> None:
-    """Write the report, one page without external assets, and say where it is."""
+    """Write the report of a store, one HTML page without external assets."""
     with busy("writing the report"):
         path = write_report(open_survey(store))
     Console().print(f"report: {path}", highlight=False, soft_wrap=True)
@@ -250,20 +261,20 @@ def report(store: StoreArgument) -> None:
 
 @app.command()
 def reference() -> None:
-    """Print the data-product reference (Markdown): every table and image, with columns, units and axes."""
-    print(data_products(), end="")
+    """Print the reference of all tables and images (Markdown), with columns, units and axes."""
+    print(data_product_reference(), end="")
 
 
 def main() -> None:
     """Run the command line."""
-    # when several chunks of a damaged file fail at once, asyncio logs all but the one that is raised
+    # when reads of several chunks of a damaged file fail, one error is raised; asyncio logs the others
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
-    # and those that had not begun are warned of
+    # and Python warns of the reads that had not started
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
         app()
     except OSError as error:
-        # a disk that is full, or may not be written, is met wherever something is written
+        # any write can meet a full or read-only disk
         if error.errno not in FULL:
             raise
         print(f"error: {error.filename}: {error.strerror}: make room; the same command resumes", file=sys.stderr)

@@ -15,8 +15,8 @@ import typer
 from romandask.storage.paths import AnyPath, parse_path
 
 
-def source_place(text: str) -> AnyPath:
-    """Return the place of something that is read."""
+def source_path(text: str) -> AnyPath:
+    """Return the path of an input."""
     return parse_path(text, "a source")
 
 
@@ -24,20 +24,34 @@ StoreOption = Annotated[
     Any,
     typer.Option("--store", metavar="FOLDER", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER."),
 ]
-Workers = Annotated[int | None, typer.Option("--workers", min=0, help="Local processes; 0 runs in this one.")]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", min=0, help="Number of local worker processes; 0 runs everything in this process."),
+]
 Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, tcp://host:port.")
+    str | None, typer.Option("--scheduler", help="Address of an existing dask scheduler, for example tcp://host:8786.")
 ]
 Spectra = Annotated[
     Any,
-    typer.Option("--seds", parser=source_place, help="Folder of the spectra that are named; default: seds beside SRC."),
+    typer.Option(
+        "--seds",
+        metavar="FOLDER",
+        parser=source_path,
+        help="Folder of the spectra that the catalog names; default: seds in the folder of the catalog.",
+    ),
 ]
-Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions.")]
+Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions of the catalogs.")]
 
 
 @contextmanager
 def resumable(text: str = "stopped; the same command resumes") -> Iterator[None]:
-    """Turn an interrupt into one line: what is stored stays, and the same command goes on from there."""
+    """Turn Ctrl-C into one line on standard error and exit code 130.
+
+    Parameters
+    ----------
+    text : str
+        The line. Stored units stay, so the same command resumes.
+    """
     try:
         yield
     except KeyboardInterrupt:

@@ -1,1 +1,1 @@
-"""Running the units of stages: what is stale, on which workers, with which progress, log and checks."""
+"""Engine: find stale units, run them on workers, report progress, write the event log and verify the store."""

@@ -1,6 +1,6 @@
-"""Running units: on a local cluster of one-thread processes, on an existing cluster, or in this process.
+"""Runners: make units on a local cluster of one-thread processes, on an existing cluster, or in this process.
 
-The only module that knows distributed.
+No other module imports distributed.
 """
 
 from __future__ import annotations
@@ -24,64 +24,71 @@ import yaml
 from distributed import Client, LocalCluster, performance_report
 
 from romandask.engine.submission import Submission, submit_units
-from romandask.engine.task import Batch, Outcome, given_up, make_unit
+from romandask.engine.task import Batch, Outcome, make_unit, skipped_outcomes
 from romandask.engine.task_queue import TaskQueue
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.storage.paths import AnyPath, write_bytes
 
-STARTS = 3
-"""Times that local workers are started before a run gives up."""
-PATIENCE = 60.0
-"""Seconds that a run waits for a cluster without workers."""
-More = Callable[[], Iterable[Batch]]
+START_ATTEMPTS = 3
+"""Number of attempts to start a local cluster."""
+NO_WORKER_TIMEOUT = 60.0
+"""Time that a run waits for a cluster without workers, s."""
+POLL_INTERVAL = 2.0
+"""Time between two looks for new workers while no task ends, s."""
+NextBatches = Callable[[], Iterable[Batch]]
+"""Returns the batches that can start now; empty if there are none."""
 
 
-def _no_more() -> Iterable[Batch]:
+def _no_batches() -> Iterable[Batch]:
     return ()
 
 
 class Runner(Protocol):
-    """Runs the units of stages."""
+    """Interface of the runners."""
 
     description: str
+    """Text for the user, for example the address of the dashboard."""
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
-        """Yield what became of each unit, as they end.
+    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
+        """Make units and yield the outcome of each as soon as it is known.
 
         Parameters
         ----------
-        begin : what is to be made
-        more : asked at the beginning, and when what was yielded has been taken, for what can be made now; again until
-            there is nothing
+        *batches : Batch
+            Units to make.
+        more : callable
+            Returns further batches. Called repeatedly, until it returns none, at the beginning and after each outcome
+            has been processed.
         """
 
     def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
-        """Write, at the end of the context, a page with what the cluster did in it."""
+        """Return a context manager that writes a performance report of the cluster (HTML) to `path` when it exits."""
 
 
 class InProcess:
-    """Runs units one after another in this process, for debugging."""
+    """Runner that makes units one after another in this process, for debugging."""
 
     description = "in this process"
 
     def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
-        """Write nothing: there is no cluster."""
+        """Return a context manager that does nothing, because there is no cluster to report on."""
         return nullcontext()
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
-        """Yield what became of each unit, a stage after the other; a failure is not tried again."""
-        batches = [*begin]
+    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
+        """Make units, one stage after another, and yield the outcome of each. A failed unit is not tried again."""
+        pending = [*batches]
         while True:
             while new := [*more()]:
-                batches += new
-            if not batches:
+                pending += new
+            if not pending:
                 return
-            batches.sort(key=lambda batch: batch.rank)
-            yield from _one_by_one(batches.pop(0))
+            pending.sort(key=lambda batch: batch.rank)
+            yield from _run_in_process(pending.pop(0))
 
 
-def _one_by_one(batch: Batch) -> Iterator[Outcome]:
+def _run_in_process(batch: Batch) -> Iterator[Outcome]:
+    # with equal costs, the queue is in the order of affinity keys and unit numbers
     product, waiting = batch.product, TaskQueue([replace(task, cost=0.0) for task in batch.tasks])
     while waiting:
         task = waiting.next()
@@ -89,11 +96,21 @@ def _one_by_one(batch: Batch) -> Iterator[Outcome]:
             yield Outcome(product.stage, task.index, make_unit(product, task, batch.store))
         except Exception as error:
             yield Outcome(product.stage, task.index, None, traceback.format_exc(), error)
-            yield from given_up(product, task.index, waiting.give_up(task.index))
+            yield from skipped_outcomes(product, task.index, waiting.give_up(task.index))
 
 
 class OnCluster:
-    """Runs units on a dask cluster, those of several stages side by side; results are released at once."""
+    """Runner that makes units on a dask cluster, those of several stages at the same time.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Client of the cluster.
+    description : str
+        Text for the user.
+    restart : callable or None
+        Starts missing workers. Called every `POLL_INTERVAL` seconds while no task ends.
+    """
 
     def __init__(self, client: Client, description: str, restart: Callable[[], None] | None = None):
         self._client = client
@@ -101,51 +118,52 @@ class OnCluster:
         self.description = description
 
     def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
-        """Write dask's performance report: task stream, transfers, profiles of workers and scheduler."""
+        """Return a context manager that writes dask's performance report: task stream, transfers and profiles."""
         return _recording(self._client, path)
 
-    def run(self, *begin: Batch, more: More = _no_more) -> Generator[Outcome, None, None]:
-        """Yield what became of each unit; one that fails is tried up to three times.
+    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
+        """Make units and yield the outcome of each. A failed unit is tried up to three times.
 
         Raises
         ------
         UserError
-            If for a minute there is no worker.
+            If the cluster has no worker for a minute.
         """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        waves = [Submission(self._client, batch, ended.put) for batch in begin]
-        seen = time.monotonic()
+        submissions = [Submission(self._client, batch, ended.put) for batch in batches]
+        last_worker_seen = time.monotonic()
         try:
             while True:
-                # as long as there are more they are asked for; in between workers get what they can do
+                # `more` may be slow: tasks are submitted between two calls of it
                 new = [Submission(self._client, batch, ended.put) for batch in more()]
-                waves = sorted(filter(None, [*waves, *new]), key=lambda wave: wave.batch.rank)
+                submissions = sorted(filter(None, [*submissions, *new]), key=lambda one: one.batch.rank)
                 threads = self._threads()
-                seen = time.monotonic() if threads else seen
-                submit_units(waves, threads)
-                if not waves and not new:
+                last_worker_seen = time.monotonic() if threads else last_worker_seen
+                submit_units(submissions, threads)
+                if not submissions and not new:
                     return
-                future = self._next(ended, 0.0 if new else 2.0)
+                future = self._next_ended(ended, 0.0 if new else POLL_INTERVAL)
                 if future is not None:
-                    yield from next(wave for wave in waves if future in wave.flown).settle(future)
-                elif time.monotonic() - seen > PATIENCE:
+                    yield from next(one for one in submissions if future in one.in_flight).settle(future)
+                elif time.monotonic() - last_worker_seen > NO_WORKER_TIMEOUT:
                     raise UserError(
-                        f"no worker has been left for {PATIENCE:.0f} s: start workers, or look for what ends them "
-                        "(memory: raise run.memory_limit); the same command resumes"
+                        f"no worker has been left for {NO_WORKER_TIMEOUT:.0f} s: start workers, or look for what ends "
+                        "them (memory: raise run.memory_limit); the same command resumes"
                     )
         finally:
-            left = [future for wave in waves for future in wave.flown]
-            if left:
-                self._client.cancel(left, force=True)
+            in_flight = [future for submission in submissions for future in submission.in_flight]
+            if in_flight:
+                self._client.cancel(in_flight, force=True)
 
     def _threads(self) -> dict[str, int]:
+        """Return the number of threads of each worker, by address."""
         workers = self._client.scheduler_info(n_workers=-1)["workers"]
         return {address: worker["nthreads"] for address, worker in workers.items()}
 
-    def _next(self, ended: queue.SimpleQueue[Any], patience: float) -> Any | None:
-        """Return the next task that ends; None after some seconds, for there may be workers that have nothing yet."""
+    def _next_ended(self, ended: queue.SimpleQueue[Any], timeout: float) -> Any | None:
+        """Return the future of the next task that ends, or None after `timeout` seconds."""
         try:
-            return ended.get(timeout=patience)
+            return ended.get(timeout=timeout)
         except queue.Empty:
             self._restart()
             return None
@@ -153,7 +171,7 @@ class OnCluster:
 
 @contextmanager
 def _recording(client: Client, path: AnyPath) -> Iterator[None]:
-    # one page without external assets, written whole
+    # dask writes a local file without external assets (inline); the store receives it as a whole
     with TemporaryDirectory(prefix="romandask-") as folder:
         temporary = Path(folder) / "performance.html"
         report = performance_report(filename=str(temporary), mode="inline")
@@ -163,25 +181,31 @@ def _recording(client: Client, path: AnyPath) -> Iterator[None]:
             yield
         finally:
             with client.as_current(), suppress(Exception):
-                # a run that is done is done, though its workers are gone and cannot be asked
+                # a report that fails because workers are gone must not fail a finished run
                 report.__exit__(None, None, None)
-                # but for its icon the page needs nothing from elsewhere
+                # the icon is the only external asset of the page
                 page = re.sub(r'<link rel="shortcut icon"[^>]*>', "", temporary.read_text(encoding="utf-8"))
                 write_bytes(path, page.encode())
 
 
 @contextmanager
 def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> Iterator[Runner]:
-    """Yield a runner: on the cluster at `scheduler`, on `workers` local processes, or, for 0, in this process.
+    """Return a context manager with a runner.
 
     Parameters
     ----------
-    memory_limit : GiB a worker
+    workers : int
+        Number of local worker processes; 0 makes the units in this process. Ignored if `scheduler` is given.
+    memory_limit : float
+        Memory of each worker, GiB.
+    scheduler : str or None
+        Address of the scheduler of an existing cluster, for example tcp://host:8786.
 
     Raises
     ------
     UserError
-        If no scheduler answers, or its workers are too small or have another version.
+        If no scheduler answers, its workers have too little memory or another version of romandask, or the local
+        workers cannot be started.
     """
     if scheduler is None and workers == 0:
         yield InProcess()
@@ -198,7 +222,7 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
         _local_cluster(workers, int(memory_limit * 2**30)) as cluster,
         Client(cluster) as client,
     ):
-        # a worker that dies while it starts is not started again by dask; to scale to what is wanted starts it
+        # dask does not restart a worker that dies during its start; scaling to the wanted number does
         description = f"{workers} local workers, dashboard {cluster.dashboard_link}"
         yield OnCluster(client, description, lambda: cluster.scale(workers))
 
@@ -207,37 +231,41 @@ def _connected(scheduler: str) -> Client:
     try:
         return Client(scheduler, timeout="20s")
     except (OSError, ValueError, TypeError, TimeoutError, RuntimeError) as error:
-        # TypeError: tls:// without certificates
+        # dask raises TypeError for tls:// without certificates
         reason = str(error) or type(error).__name__
-    # a client that could not begin closes itself when it is collected: now, for while another one starts in this
-    # process it would wait for ever
+    # A client that could not connect closes itself when it is collected. It is collected now, because the close would
+    # wait for ever while another client starts in this process.
     gc.collect()
     raise UserError(f"--scheduler {scheduler}: no dask scheduler answers there ({reason})")
 
 
-def on_client(client: Client, memory_limit: float, place: str = "the cluster") -> OnCluster:
-    """Return a runner on the cluster that a client is connected to.
+def on_client(client: Client, memory_limit: float, cluster_name: str = "the cluster") -> OnCluster:
+    """Return a runner on the cluster of a client.
 
     Parameters
     ----------
-    memory_limit : GiB a worker
-    place : what an error calls the cluster
+    client : distributed.Client
+        Connected client.
+    memory_limit : float
+        Memory that each worker must have, GiB.
+    cluster_name : str
+        Name of the cluster in error messages.
 
     Raises
     ------
     UserError
-        If its workers are too small or have another version.
+        If the workers have too little memory or another version of romandask.
     """
-    _check_workers(client, place, memory_limit)
+    _check_workers(client, cluster_name, memory_limit)
     return OnCluster(
         client, f"cluster at {client.scheduler_info(n_workers=0)['address']}, dashboard {client.dashboard_link}"
     )
 
 
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
-    """Start processes of one thread on the loopback; again where one dies before it has begun."""
+    """Start one-thread worker processes on the loopback interface; start again if one dies during its start."""
     reason = ""
-    for _ in range(STARTS):
+    for _ in range(START_ATTEMPTS):
         try:
             return LocalCluster(
                 n_workers=workers,
@@ -255,23 +283,23 @@ def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
     )
 
 
-def _check_workers(client: Client, place: str, memory_limit: float) -> None:
-    """Look at the workers that are there: others may come, and go."""
+def _check_workers(client: Client, cluster_name: str, memory_limit: float) -> None:
+    """Check memory and version of the workers present now. Workers that join later are not checked."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
     smallest = min((worker["memory_limit"] or float("inf") for worker in workers), default=float("inf"))
-    # what a shell calls 2 GB is 7% less than 2 GiB
+    # a worker started with "--memory-limit 2GB" has 7% less than 2 GiB and is accepted
     if smallest < 0.93 * memory_limit * 2**30:
         raise UserError(
-            f"{place}: a worker has {smallest / 2**30:.2f} GiB, run.memory_limit is {memory_limit:g}: "
+            f"{cluster_name}: a worker has {smallest / 2**30:.2f} GiB, run.memory_limit is {memory_limit:g}: "
             "start workers with --memory-limit, or lower run.memory_limit"
         )
     try:
         versions = set(client.run(_version).values())
     except (ImportError, AttributeError) as error:
-        raise UserError(f"{place}: a worker cannot load romandask ({error}): install it there") from None
+        raise UserError(f"{cluster_name}: a worker cannot load romandask ({error}): install it there") from None
     if versions - {version("romandask")}:
         raise UserError(
-            f"{place}: a worker has romandask {', '.join(sorted(versions))}, this is "
+            f"{cluster_name}: a worker has romandask {', '.join(sorted(versions))}, this is "
             f"{version('romandask')}: install the same everywhere"
         )
 
@@ -281,7 +309,7 @@ def _version() -> str:
 
 
 def _free_port(wanted: int) -> int:
-    """Return a port of the loopback if it is free, else 0 (any)."""
+    """Return the wanted port if it is free on the loopback interface, else 0 (any port)."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,4 +1,4 @@
-"""The log of a run: one line of JSON an event, in the order in which they happened."""
+"""Event log of a run: one line of JSON for each event, in chronological order."""
 
 from __future__ import annotations
 
@@ -11,60 +11,66 @@ from typing import Any
 
 from romandask.storage.paths import AnyPath, file_names, write_bytes
 
-ENDING = ".jsonl"
-EVERY = 10.0
-"""Seconds after which a part is written of a log whose store takes whole objects alone."""
+LOG_SUFFIX = ".jsonl"
+FLUSH_INTERVAL = 10.0
+"""Time between two writes of a log to an object store, s."""
 
 
 class Log:
-    """Writes the events of one run, a line each; what a crash cuts is the last line, or the last part.
+    """Writer of the event log of one run, one line for each event.
 
-    In a folder of this machine they go to one file; in an object store, where nothing can be appended to, to one object
-    every few seconds.
+    In a local folder, every event is appended to one file. An object store cannot append, so there the log is a
+    sequence of objects, and a new one is written every `FLUSH_INTERVAL` seconds. After a crash, at most the last line
+    or the last object is incomplete.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the logs of a store. A local folder is created.
     """
 
     def __init__(self, folder: AnyPath):
         self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"
         self._folder = folder
         self._lines: list[str] = []
-        self._parts, self._written = 0, time.monotonic()
+        self._parts_written, self._last_flush = 0, time.monotonic()
         if isinstance(folder, Path):
             folder.mkdir(parents=True, exist_ok=True)
 
-    def beside(self, ending: str) -> AnyPath:
-        """Return the file of the log's name with another ending."""
-        return self._folder / f"{self.name}{ending}"
+    def path_with(self, suffix: str) -> AnyPath:
+        """Return the path of a file in the log folder, named after this log, with the given suffix."""
+        return self._folder / f"{self.name}{suffix}"
 
     def write(self, event: str, **values: Any) -> None:
-        """Write one event with the time (UTC, ISO 8601) at which it happened."""
+        """Write one event with the current time (UTC, ISO 8601)."""
         line = json.dumps({"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **values})
         if isinstance(self._folder, Path):
-            with open(self._folder / f"{self.name}{ENDING}", "a", encoding="utf-8") as file:
+            with open(self._folder / f"{self.name}{LOG_SUFFIX}", "a", encoding="utf-8") as file:
                 file.write(line + "\n")
             return
         self._lines.append(line + "\n")
-        if time.monotonic() - self._written > EVERY or event != "unit":
+        if time.monotonic() - self._last_flush > FLUSH_INTERVAL or event != "unit":
             self.flush()
 
     def flush(self) -> None:
-        """Write the events that are not yet in the store."""
+        """Write the events that are not yet in the object store."""
         if self._lines:
-            write_bytes(self.beside(f"-{self._parts:06d}{ENDING}"), "".join(self._lines).encode())
-            self._lines, self._parts = [], self._parts + 1
-        self._written = time.monotonic()
+            write_bytes(self.path_with(f"-{self._parts_written:06d}{LOG_SUFFIX}"), "".join(self._lines).encode())
+            self._lines, self._parts_written = [], self._parts_written + 1
+        self._last_flush = time.monotonic()
 
 
 def runs(folder: AnyPath) -> list[str]:
-    """Return the names of the logs of a store, in the order of their runs."""
-    return sorted({name.split("-")[0] for name in file_names(folder, ENDING)})
+    """Return the names of the logs in a folder, oldest run first."""
+    return sorted({name.split("-")[0] for name in file_names(folder, LOG_SUFFIX)})
 
 
 def events(folder: AnyPath, run: str) -> Iterator[dict[str, Any]]:
-    """Yield the events of a log; a last line that was cut is left out."""
-    for name in file_names(folder, ENDING):
+    """Yield the events of the log of a run, up to the first incomplete line."""
+    for name in file_names(folder, LOG_SUFFIX):
         if name.split("-")[0] != run:
             continue
-        for line in (folder / f"{name}{ENDING}").read_text(encoding="utf-8").splitlines():
+        for line in (folder / f"{name}{LOG_SUFFIX}").read_text(encoding="utf-8").splitlines():
             try:
                 yield json.loads(line)
             except ValueError:
@@ -72,9 +78,9 @@ def events(folder: AnyPath, run: str) -> Iterator[dict[str, Any]]:
 
 
 def newest_event(folder: AnyPath) -> dict[str, Any] | None:
-    """Return what happened last in the newest run; None where no run has a log."""
-    found = runs(folder)
+    """Return the last event of the newest run, or None if the folder has no log."""
+    names = runs(folder)
     last = None
-    for event in events(folder, found[-1]) if found else ():
+    for event in events(folder, names[-1]) if names else ():
         last = event
     return last

@@ -1,4 +1,4 @@
-"""Progress: a bar a stage on a terminal, plain lines elsewhere, and never long without a word."""
+"""Progress of a run: one bar per stage on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -13,83 +13,96 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-INTERVAL = 5.0
-"""Seconds between plain lines."""
-QUIET = 8.0
-"""Seconds after which what is being done is said again."""
+LINE_INTERVAL = 5.0
+"""Minimum time between two plain lines of a stage, s."""
+MAX_SILENCE = 8.0
+"""Time without output after which the current activity is printed again, s."""
 
 
 class Meter(Protocol):
-    """Counts the units of a stage."""
+    """Counter of the finished units of a stage."""
 
     def advance(self, cost: float, seconds: float = math.inf) -> None:
-        """Count one more unit, its cost, and how long it took."""
+        """Count one more unit.
+
+        Parameters
+        ----------
+        cost : float
+            Cost of the unit, in the unit of the total cost of the stage.
+        seconds : float
+            Wall time of making the unit, s.
+        """
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Pace:
-    """How far a stage is, and by the cost of its units when it will be done."""
+    """Progress of a stage, with an estimate of the remaining time from the cost of its units."""
 
     units: int
+    """Number of units of the stage that the run makes."""
     cost: float
-    """Of all units, in any measure."""
+    """Total cost of these units, in any unit."""
     start: float
-    """Time, seconds."""
+    """Start time of the stage, s."""
     done: int = 0
-    spent: float = 0.0
-    """Cost of the units that are done."""
-    worked: float = 0.0
-    """Seconds in which units of it were made: other stages may have had the workers in between."""
-    last: float = 0.0
-    """When the last one was done."""
+    """Number of finished units."""
+    cost_done: float = 0.0
+    """Total cost of the finished units."""
+    seconds_worked: float = 0.0
+    """Time during which units of this stage were made, s. Excludes the time when other stages had the workers."""
+    last_end: float = 0.0
+    """Time at which the last unit finished, s; 0 before the first one."""
 
     def advance(self, cost: float, now: float, seconds: float = math.inf) -> None:
-        """Count one more unit, that was done now and took some seconds."""
-        self.worked += min(now - (self.last or self.start), seconds)
-        self.done, self.spent, self.last = self.done + 1, self.spent + cost, now
+        """Count one more unit, which finished at the time `now` and took the wall time `seconds`."""
+        self.seconds_worked += min(now - (self.last_end or self.start), seconds)
+        self.done, self.cost_done, self.last_end = self.done + 1, self.cost_done + cost, now
 
-    def left(self) -> float | None:
-        """Return seconds of work until the stage is done; None where it is, or nothing by which to tell."""
-        known = self.spent > 0 and self.done < self.units
-        return self.worked * (self.cost - self.spent) / self.spent if known else None
+    def seconds_left(self) -> float | None:
+        """Return the estimated remaining time, s; None if the stage has finished or no unit has."""
+        known = self.cost_done > 0 and self.done < self.units
+        return self.seconds_worked * (self.cost - self.cost_done) / self.cost_done if known else None
 
     def text(self, name: str, now: float) -> str:
-        """Return one line."""
+        """Return one line with the name of the stage, its finished units, and elapsed and remaining time."""
         line = f"{name:20s} {self.done}/{self.units} units  {now - self.start:.1f} s"
-        left = self.left()
+        left = self.seconds_left()
         return line if left is None else f"{line}, about {duration(left)} left"
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time as one reads it: 40 s, 12 min, 3.5 h."""
+    """Return a time span as text in s, min or h: `40 s`, `12 min`, `3.5 h`."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class Reporter:
-    """Writes what a run does to a console."""
+    """Writer of the messages and the progress of a run to a console."""
 
     def __init__(self, console: Console):
         self.console = console
-        self._said = time.monotonic()
+        self._last_output = time.monotonic()
 
     def say(self, text: str) -> None:
         """Write one line."""
-        self._said = time.monotonic()
+        self._last_output = time.monotonic()
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
     @contextmanager
     def busy(self, text: Callable[[], str] | str) -> Iterator[None]:
-        """Write what is being done, and for how long, whenever nothing has been written for some seconds.
+        """Write the current activity and its duration after every `MAX_SILENCE` seconds without output.
 
-        Where `text` returns nothing, there is nothing to say.
+        Parameters
+        ----------
+        text : str or callable
+            The activity, or a function that returns the whole line; an empty line is not written.
         """
         ended, start = threading.Event(), time.monotonic()
 
         def watch() -> None:
             while not ended.wait(0.5):
-                if (now := time.monotonic()) - self._said > QUIET:
+                if (now := time.monotonic()) - self._last_output > MAX_SILENCE:
                     line = text() if callable(text) else f"{text}: {duration(now - start)}"
                     if line:
                         self.say(line)
@@ -104,7 +117,7 @@ class Reporter:
 
     @contextmanager
     def board(self) -> Iterator[Board]:
-        """Show the progress of stages, several of which may be under way."""
+        """Show the progress of stages, several of which may be active at the same time."""
         if self.console.is_terminal:
             columns = (
                 TextColumn("{task.description:18s}"),
@@ -115,7 +128,7 @@ class Reporter:
             )
             with Progress(*columns, console=self.console) as progress:
                 yield _Bars(self, progress)
-            self._said = time.monotonic()
+            self._last_output = time.monotonic()
         else:
             lines = _Lines(self)
             with self.busy(lines.text):
@@ -123,23 +136,35 @@ class Reporter:
 
 
 class Board(Protocol):
-    """The progress of the stages that are under way."""
+    """Display of the progress of the active stages."""
 
     def begin(self, name: str, units: int, cost: float) -> Meter:
-        """Show a stage of some units, of a cost in all, until all of them are counted."""
+        """Show a stage until all its units are counted.
+
+        Parameters
+        ----------
+        name : str
+            Name of the stage.
+        units : int
+            Number of units to make.
+        cost : float
+            Total cost of these units.
+        """
 
 
 def busy(text: str) -> AbstractContextManager[None]:
-    """Write what a command is doing, and for how long, every few seconds that it takes."""
+    """Write the activity of a command and its duration to standard output, every few seconds."""
     return Reporter(Console()).busy(text)
 
 
 class _Bars:
+    """Display of one bar per active stage on a terminal."""
+
     def __init__(self, reporter: Reporter, progress: Progress):
         self._reporter, self._progress = reporter, progress
 
     def begin(self, name: str, units: int, cost: float) -> Meter:
-        return _Bar(self._reporter, self._progress, name, Pace(units, cost, time.monotonic()))
+        return _Bar(self._reporter, self._progress, name, Pace(units=units, cost=cost, start=time.monotonic()))
 
 
 class _Bar:
@@ -149,39 +174,42 @@ class _Bar:
 
     def advance(self, cost: float, seconds: float = math.inf) -> None:
         self._pace.advance(cost, time.monotonic(), seconds)
-        left = self._pace.left()
+        left = self._pace.seconds_left()
         text = "" if left is None else f"{duration(left)} left"
         self._progress.update(self._task, advance=cost, done=self._pace.done, left=text)
         if self._pace.done == self._pace.units:
-            # bars are of what is under way; of what is done one line stays
+            # one plain line replaces the bar of a finished stage, so that bars show active stages only
             self._progress.remove_task(self._task)
             self._reporter.say(self._pace.text(self._name, time.monotonic()))
 
 
 class _Lines:
+    """Display of plain lines, for output that is not a terminal."""
+
     def __init__(self, reporter: Reporter):
         self._reporter = reporter
-        self._going: dict[str, Pace] = {}
+        self._active: dict[str, Pace] = {}
 
     def begin(self, name: str, units: int, cost: float) -> Meter:
-        pace = self._going[name] = Pace(units, cost, time.monotonic())
-        return _Line(self._reporter, name, pace, self._going)
+        pace = self._active[name] = Pace(units=units, cost=cost, start=time.monotonic())
+        return _Line(self._reporter, name, pace, self._active)
 
     def text(self) -> str:
-        return "\n".join(pace.text(name, time.monotonic()) for name, pace in self._going.copy().items())
+        """Return one line for each active stage."""
+        return "\n".join(pace.text(name, time.monotonic()) for name, pace in self._active.copy().items())
 
 
 class _Line:
-    def __init__(self, reporter: Reporter, name: str, pace: Pace, going: dict[str, Pace]):
-        self._reporter, self._name, self._pace, self._going = reporter, name, pace, going
-        self._last = pace.start
+    def __init__(self, reporter: Reporter, name: str, pace: Pace, active: dict[str, Pace]):
+        self._reporter, self._name, self._pace, self._active = reporter, name, pace, active
+        self._last_line = pace.start
 
     def advance(self, cost: float, seconds: float = math.inf) -> None:
         now = time.monotonic()
         self._pace.advance(cost, now, seconds)
-        done = self._pace.done == self._pace.units
-        if done:
-            del self._going[self._name]
-        if done or now - self._last > INTERVAL:
-            self._last = now
+        finished = self._pace.done == self._pace.units
+        if finished:
+            del self._active[self._name]
+        if finished or now - self._last_line > LINE_INTERVAL:
+            self._last_line = now
             self._reporter.say(self._pace.text(self._name, now))

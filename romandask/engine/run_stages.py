@@ -1,4 +1,4 @@
-"""Run stages: each begins when those that it reads have ended, beside others that are under way."""
+"""Run stages: each starts when the stages that it reads have ended; several may be active at the same time."""
 
 from __future__ import annotations
 
@@ -28,18 +28,20 @@ from romandask.storage.store import Store, refuse_full
 Product = ImageProduct | TableProduct
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Summary:
-    """What a run did."""
+    """Summary of a run."""
 
     begun: int = 0
-    """Units that were handed out."""
+    """Number of stale units of the stages that started."""
     made: dict[str, int] = field(default_factory=dict)
+    """Number of units made, by stage."""
     kept: dict[str, int] = field(default_factory=dict)
+    """Number of units that were up to date, by stage."""
     failed: list[str] = field(default_factory=list)
-    """stage/unit of units that were set aside, and of those that wait for them."""
+    """stage/unit of the units that failed or were skipped."""
     warnings: Counter[str] = field(default_factory=Counter)
-    """What units warned of, and how many did."""
+    """Number of units that raised each warning, by text."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,95 +50,106 @@ class RunnableStage:
 
     name: str
     product: Callable[[], Product]
-    """Returns the lazy product; called once `known_after` have ended."""
+    """Returns the lazy product; called after the stages in `known_after` have ended."""
     reads: frozenset[str] = frozenset()
-    """Names of the products whose units its units are made from."""
+    """Names of the products whose units the units of this stage read."""
     known_after: frozenset[str] = frozenset()
-    """Names of the products whose content decides which units it has."""
+    """Names of the products whose content determines the units of this stage."""
     sky: tuple[str, str] | None = None
-    """Columns of right ascension and declination where it is a HATS catalog."""
+    """Names of the columns of right ascension and declination, for a HATS catalog; None for other products."""
     finish: Callable[[], tuple[str, list[AnyPath]]] | None = None
-    """Writes what the stage has beside its units; returns a name and the files, whose checksums are kept under it."""
+    """Writes the files of the stage that belong to no unit. Returns a name for their checksums, and their paths."""
     ended: Callable[[int], None] = lambda made: None
-    """Called when the stage has ended, with the number of units that were made."""
+    """Called with the number of units made when the stage has ended."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the stages of one run share."""
+    """Resources that the stages of one run share."""
 
     store: Store
     runner: Runner
     reporter: Reporter
     log: Log
     retry: bool
+    """Make again the units that failed in an earlier run."""
     summary: Summary = field(default_factory=Summary)
     ends: ExitStack = field(default_factory=ExitStack)
-    """Contexts that are closed when the run ends."""
+    """Context managers that exit when the run ends."""
 
 
 def run_stages(stages: list[RunnableStage], this: Run) -> None:
     """Make and store the stale units of some stages.
 
-    A unit that fails is skipped: the units that need it wait and are reported, all others go on.
+    A unit that fails is skipped, and so are the units that need it; all other units are made.
+
+    Parameters
+    ----------
+    stages : list of RunnableStage
+        Stages in the order of the plan.
+    this : Run
+        Store, runner and log; its summary is filled.
 
     Raises
     ------
     UserError
-        If the store's disk is full or read-only: every other unit would fail too.
+        If the disk of the store is full or read-only, because all other units would fail too.
+    RuntimeError
+        If stages wait for one another.
     """
     with this.reporter.board() as board:
         schedule = _Schedule(stages, this, board)
         with closing(this.runner.run(more=schedule.ready)) as outcomes:
             for outcome in outcomes:
-                schedule.take(outcome)
-    if schedule.stuck:
-        raise RuntimeError(f"stages that wait for one another: {', '.join(schedule.stuck)}")
+                schedule.process(outcome)
+    if schedule.unfinished:
+        raise RuntimeError(f"stages that wait for one another: {', '.join(schedule.unfinished)}")
 
 
 @dataclass
 class _Active:
-    """A stage that is under way."""
+    """A stage whose tasks have been submitted."""
 
     stage: RunnableStage
     product: Product
     tasks: dict[int, Task]
-    """Tasks that have not ended, by unit number."""
+    """Tasks without an outcome, by unit number."""
     meter: Meter
 
 
 class _Schedule:
-    """The stages of a run: those to come, those under way, and what begins and ends them."""
+    """Schedule of the stages of a run: pending and active stages, and the start and end of each."""
 
     def __init__(self, stages: list[RunnableStage], this: Run, board: Board):
         self._this, self._board = this, board
         self._ranks = {stage.name: rank for rank, stage in enumerate(stages)}
-        self._coming = {stage.name: stage for stage in stages}
+        self._pending = {stage.name: stage for stage in stages}
         self._active: dict[str, _Active] = {}
-        self._changed = True
+        self._check_pending = True
+        """Whether a stage may have become able to start since the last search for one."""
 
     @property
-    def stuck(self) -> list[str]:
+    def unfinished(self) -> list[str]:
         """Names of the stages that have not ended."""
-        return [*self._active, *self._coming]
+        return [*self._active, *self._pending]
 
     def ready(self) -> list[Batch]:
-        """Begin the next stage that can begin and return its tasks; a stage without stale units ends at once.
+        """Start the next stage that can start, and return its tasks; a stage without stale units ends immediately.
 
-        One stage at a time, so that workers have tasks while the stale units of the next stage are looked for.
+        Starts one stage per call, so that workers have tasks while the stale units of the next stage are found.
         """
-        while self._changed:
+        while self._check_pending:
             stage = self._next()
             if stage is None:
-                self._changed = False
+                self._check_pending = False
                 break
-            del self._coming[stage.name]
+            del self._pending[stage.name]
             if active := self._begin(stage):
                 return [Batch(active.product, [*active.tasks.values()], self._this.store, self._ranks[stage.name])]
         return []
 
-    def take(self, outcome: Outcome) -> None:
-        """Log the outcome of a unit, and end its stage with the last one; a failure is kept with its traceback."""
+    def process(self, outcome: Outcome) -> None:
+        """Log the outcome of a unit, store its failure with the traceback, and end the stage after its last unit."""
         this, stage = self._this, outcome.stage
         active, record = self._active[stage], outcome.record
         task, unit = active.tasks.pop(outcome.index), active.product.names[outcome.index]
@@ -162,23 +175,23 @@ class _Schedule:
             this.log.write("failed", stage=stage, unit=unit, why=task.why, reason=str(outcome.failure))
         if not active.tasks:
             del self._active[stage]
-            self._changed = True
+            self._check_pending = True
             self._end(active.stage, active.product)
 
     def _next(self) -> RunnableStage | None:
-        """Return the first stage that waits for no other; None where there is none."""
-        unfinished = {*self._coming, *self._active}
+        """Return the first pending stage that waits for no other stage, or None."""
+        unfinished = set(self.unfinished)
         return next(
             (
                 stage
-                for stage in self._coming.values()
+                for stage in self._pending.values()
                 if not ((stage.reads | stage.known_after) - {stage.name}) & unfinished
             ),
             None,
         )
 
     def _begin(self, stage: RunnableStage) -> _Active | None:
-        """Find the stale units of a stage; None where there are none, and the stage has ended."""
+        """Find the stale units of a stage and start it; without stale units, end it and return None."""
         this = self._this
         with this.reporter.busy(f"{stage.name}: finding what there is to do"):
             product = stage.product()
@@ -192,7 +205,7 @@ class _Schedule:
         remove_checksums(this.store, stage.name)
         product.prepare(this.store)
         if not this.summary.begun:
-            this.ends.enter_context(this.runner.recording(this.log.beside(".html")))
+            this.ends.enter_context(this.runner.recording(this.log.path_with(".html")))
         this.summary.begun += len(todo.tasks)
         this.log.write("stage", stage=stage.name, make=len(todo.tasks), keep=todo.kept, blocked=len(todo.blocked))
         meter = self._board.begin(stage.name, len(todo.tasks), sum(task.cost for task in todo.tasks))
@@ -204,12 +217,12 @@ class _Schedule:
         summary = self._this.summary
         summary.made[stage], summary.kept[stage] = 0, todo.kept
         summary.failed += [f"{stage}/{name} (an input is missing)" for name in todo.blocked]
-        summary.failed += [f"{stage}/{name} (set aside, it failed before)" for name in todo.failed]
+        summary.failed += [f"{stage}/{name} (skipped, it failed before)" for name in todo.failed]
 
     def _end(self, stage: RunnableStage, product: Product) -> None:
-        """Write what a stage has beside its units: the files of a catalog, spectra, checksums."""
+        """Write the files of a stage that belong to no unit: catalog metadata, spectra and checksums."""
         store, made = self._this.store, self._this.summary.made[stage.name]
-        # a stage without checksums was not finished by the run that made its last unit
+        # the run that made the last unit of a stage without checksums was interrupted before it wrote them
         unfinished = made or not has_checksums(store, stage.name)
         if stage.sky is not None and isinstance(product, TableProduct):
             if unfinished or not (store.catalog(stage.name) / "hats.properties").exists():

@@ -1,4 +1,4 @@
-"""Staleness: the units of a stage that are missing or outdated, and those that failed before."""
+"""Staleness: find the units of a stage that are missing or outdated, and keep the failures of earlier runs."""
 
 from __future__ import annotations
 
@@ -15,52 +15,56 @@ from romandask.storage.paths import AnyPath, file_names, read_files, remove, wri
 from romandask.storage.store import Store
 
 FAILED_BEFORE = "failed before"
-FAILED = ".failed"
-"""Ending of the files that say why a unit failed."""
+FAILURE_SUFFIX = ".failed"
+"""Suffix of the files that hold the failure of a unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Staleness:
-    """The units of a stage by what a run does with them."""
+    """The units of a stage, grouped by what a run does with them."""
 
     tasks: list[Task]
-    """Stale units, missing or outdated, that can be made."""
+    """Stale units (missing or outdated) that can be made."""
     kept: int
     """Number of units that are up to date."""
     blocked: list[str]
-    """Units that cannot be made because an input is missing."""
+    """Names of units that cannot be made because an input is missing."""
     failed: list[str]
-    """Units that failed before and whose inputs have not changed since: they are skipped."""
+    """Names of units that are skipped: they failed in an earlier run, and their input hash has not changed since."""
     outdated: list[str]
-    """Units that have a record which no longer holds."""
+    """Names of units with a record that is no longer valid."""
 
 
 def find_stale(
     product: ImageProduct | TableProduct,
     store: Store,
-    coming: Set[tuple[str, str]] = frozenset(),
+    planned: Set[tuple[str, str]] = frozenset(),
     retry: bool = False,
 ) -> Staleness:
-    """Return the units of a stage by what a run would do with them. Nothing is changed.
+    """Return the units of a stage, grouped by what a run would do with them. Nothing is changed.
 
     Parameters
     ----------
-    coming : set of (stage, unit)
-        Units of earlier stages that will be made first, where a run is only explained.
+    product : ImageProduct or TableProduct
+        Product of the stage.
+    store : Store
+        Store with the records.
+    planned : set of (stage, unit)
+        Units of earlier stages that a run would make first; used to explain a run without making anything.
     retry : bool
-        Make again what failed before.
+        Make again the units that failed in an earlier run.
     """
     outputs: dict[str, dict[str, str]] = {}
 
     def output(source: tuple[str, str]) -> str | None:
-        if source in coming:
+        if source in planned:
             return "to be made"
         stage, name = source
         if stage not in outputs:
             outputs[stage] = {unit: record.output for unit, record in read_records(store, stage) if record}
         return outputs[stage].get(name)
 
-    records, failed_with = dict(read_records(store, product.stage)), failures(store, product.stage)
+    records, failed_inputs = dict(read_records(store, product.stage)), failures(store, product.stage)
     tasks: dict[str, Task] = {}
     prerequisites: dict[str, tuple[str, ...]] = {}
     blocked: list[str] = []
@@ -77,7 +81,7 @@ def find_stale(
         if record is not None and record.inputs == inputs:
             kept += 1
             continue
-        failed_before = failed_with.get(unit.name) == inputs
+        failed_before = failed_inputs.get(unit.name) == inputs
         if failed_before and not retry:
             skipped.append(unit.name)
             continue
@@ -85,33 +89,39 @@ def find_stale(
         outdated += [unit.name] if unit.name in records else []
         tasks[unit.name] = Task(index, inputs, unit.cost, unit.affinity, parts=parts, why=why)
         prerequisites[unit.name] = unit.prerequisites
-    held = _held(prerequisites, {*blocked, *skipped})
+    without_prerequisites = _without_prerequisites(prerequisites, {*blocked, *skipped})
     ready = [
         replace(task, prerequisites=tuple(tasks[other].index for other in prerequisites[name] if other in tasks))
         for name, task in tasks.items()
-        if name not in held
+        if name not in without_prerequisites
     ]
-    return Staleness(tasks=ready, kept=kept, blocked=blocked + sorted(held), failed=skipped, outdated=outdated)
+    return Staleness(
+        tasks=ready,
+        kept=kept,
+        blocked=blocked + sorted(without_prerequisites),
+        failed=skipped,
+        outdated=outdated,
+    )
 
 
-def remove_outdated_records(product: ImageProduct | TableProduct, store: Store, found: Staleness) -> None:
-    """Remove the records of units that are to be made again, or cannot be."""
-    for name in found.outdated:
+def remove_outdated_records(product: ImageProduct | TableProduct, store: Store, staleness: Staleness) -> None:
+    """Remove the records that are no longer valid."""
+    for name in staleness.outdated:
         remove(store.record(product.stage, name))
 
 
 def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
-    """Return what a unit depends on, by name: its settings, the version, and what it reads of each stage."""
-    read: dict[str, list[str | None]] = {}
+    """Return the parts of the input hash of a unit: settings, version, and the outputs it reads of each stage."""
+    outputs: dict[str, list[str | None]] = {}
     for source in (*unit.inputs, *unit.optional):
-        read.setdefault(source[0], []).append(output(source))
+        outputs.setdefault(source[0], []).append(output(source))
     return {"settings": digest(unit.settings), "version": version("romandask")} | {
-        stage: digest(found) for stage, found in read.items()
+        stage: digest(hashes) for stage, hashes in outputs.items()
     }
 
 
 def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) -> str:
-    """Return why a unit is made."""
+    """Return the reason why a unit is stale."""
     record = records.get(name)
     if record is None:
         return "damaged record" if name in records else "not there"
@@ -123,18 +133,28 @@ def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) ->
     return f"changed: {', '.join(changed)}"
 
 
-def _held(prerequisites: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
-    """Return the units of which a prerequisite, or a prerequisite of that, cannot be made."""
-    held: set[str] = set()
-    while found := {
-        name for name, before in prerequisites.items() if name not in held and set(before) & (missing | held)
+def _without_prerequisites(prerequisites: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
+    """Return the units with a direct or indirect prerequisite that cannot be made."""
+    blocked: set[str] = set()
+    while newly_blocked := {
+        name for name, names in prerequisites.items() if name not in blocked and set(names) & (missing | blocked)
     }:
-        held |= found
-    return held
+        blocked |= newly_blocked
+    return blocked
 
 
 def remove_stray_records(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
-    """Remove the records of units that a stage no longer has, and the failures of those and of what is `made` now."""
+    """Remove the records and failures of units that a stage no longer has, and the failures of units to be made now.
+
+    Parameters
+    ----------
+    product : ImageProduct or TableProduct
+        Product of the stage.
+    store : Store
+        Store with the records.
+    made : set of str
+        Names of the units that the run makes.
+    """
     names = set(product.names)
     for name in store.recorded(product.stage):
         if name not in names:
@@ -145,20 +165,20 @@ def remove_stray_records(product: ImageProduct | TableProduct, store: Store, mad
 
 
 def failed(store: Store, stage: str) -> list[str]:
-    """Return the units of a stage that failed."""
-    return file_names(store.records(stage), FAILED)
+    """Return the names of the units of a stage that failed."""
+    return file_names(store.records(stage), FAILURE_SUFFIX)
 
 
 def failures(store: Store, stage: str) -> dict[str, str]:
-    """Return the units of a stage that failed, each with the hash of what it depended on then."""
-    found = read_files(store.records(stage), FAILED)
-    return {name: text.split(b"\n", 1)[0].decode(errors="replace").removeprefix("inputs ") for name, text in found}
+    """Return the input hashes, at the time of the failure, of the units of a stage that failed."""
+    files = read_files(store.records(stage), FAILURE_SUFFIX)
+    return {name: text.split(b"\n", 1)[0].decode(errors="replace").removeprefix("inputs ") for name, text in files}
 
 
 def write_failure(store: Store, stage: str, unit: str, inputs: str, text: str) -> None:
-    """Write why a unit failed, and the hash of what it depends on: until that changes it stays set aside."""
+    """Write the failure text and the input hash of a unit. The unit is skipped until its input hash changes."""
     write_bytes(_failure(store, stage, unit), f"inputs {inputs}\n{text}".encode())
 
 
 def _failure(store: Store, stage: str, unit: str) -> AnyPath:
-    return store.records(stage) / f"{unit}{FAILED}"
+    return store.records(stage) / f"{unit}{FAILURE_SUFFIX}"

@@ -1,4 +1,4 @@
-"""Handing units to a cluster in bounded waves: of the first stage first, long units first, each to a free worker."""
+"""Submission of tasks to a cluster: a bounded number in flight, earlier stages first, long units to free workers."""
 
 from __future__ import annotations
 
@@ -10,145 +10,183 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from romandask.engine.task import Batch, Outcome, Task, after_failed, given_up, make_unit
+from romandask.engine.task import Batch, Outcome, Task, failed_prerequisite_text, make_unit, skipped_outcomes
 from romandask.engine.task_queue import TaskQueue
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 
 ATTEMPTS = 3
-"""A unit that fails this often is set aside."""
+"""Number of attempts after which a failing unit is skipped."""
 IN_FLIGHT_PER_THREAD = 4
-"""Units in flight a thread of a worker: enough to keep it busy, few enough that nothing piles up."""
+"""Maximum number of submitted tasks per worker thread: enough to keep the thread busy, few enough to limit the queue
+of the scheduler."""
 LONG_UNIT_SECONDS = 5.0
-"""Seconds: longer units are given out one a thread, to those that are free. One that waits behind another on its
-worker stays there, for dask moves only units of a kind that it has timed, and others would end with nothing to do."""
+"""Wall time per unit above which a stage has at most one task in flight per worker thread, s.
+
+Long tasks are sent to a worker with a free thread. dask moves a queued task to an idle worker only after it has timed
+tasks of the same kind, so a second long task would wait behind the first one while other workers have nothing to do.
+"""
 
 
 @dataclass(frozen=True)
 class InFlight:
-    """A unit that has been handed out."""
+    """A submitted task."""
 
     task: Task
-    place: str | None
-    """The worker that it was meant for; None for any."""
+    worker: str | None
+    """Address of the preferred worker; None for any worker."""
 
 
 class Submission:
-    """The units of a batch: those that wait, those in flight, and what becomes of them."""
+    """The tasks of one batch: waiting, in flight and finished.
 
-    def __init__(self, client: Any, batch: Batch, ended: Callable[[Any], None]):
+    Parameters
+    ----------
+    client : distributed.Client
+        Client of the cluster.
+    batch : Batch
+        Tasks of one stage.
+    on_end : callable
+        Called with the future of each task that ends.
+    """
+
+    def __init__(self, client: Any, batch: Batch, on_end: Callable[[Any], None]):
         self.batch = batch
         self.waiting = TaskQueue(batch.tasks)
         self.long = batch.product.seconds_per_unit > LONG_UNIT_SECONDS
-        self.flown: dict[Any, InFlight] = {}
-        """Units in flight by their future."""
-        self._client, self._ended = client, ended
-        self._flying: dict[int, Any] = {}
-        self._tries: Counter[int] = Counter()
-        self._missing = {task.index for task in batch.tasks}
+        self.in_flight: dict[Any, InFlight] = {}
+        """Submitted tasks by future."""
+        self._client, self._on_end = client, on_end
+        self._futures: dict[int, Any] = {}
+        """Futures of the tasks in flight, by unit number."""
+        self._attempts: Counter[int] = Counter()
+        self._not_made = {task.index for task in batch.tasks}
         self._failed: set[int] = set()
-        self._known: dict[str, str] = {}
+        self._last_affinity: dict[str, str] = {}
+        """Affinity key of the last task that was sent to each worker."""
         self._name, self._token = batch.product.stage.replace("/", "-"), uuid.uuid4().hex[:8]
         self._number = itertools.count()
-        # the product goes to every worker once; a task carries only its number and its hash. It is the result of a
-        # task, not scattered data: when the workers that hold it die the scheduler can make it again
-        self._product = client.submit(_itself, batch.product, key=f"{self._name}-product-{self._token}")
+        # The product is sent to every worker once; a task carries only its number and hash. The product is the result
+        # of a task and not scattered, so that the scheduler can recompute it when the workers that hold it die.
+        self._product = client.submit(_identity, batch.product, key=f"{self._name}-product-{self._token}")
 
     def __bool__(self) -> bool:
-        """True while there is a unit of which it is not known what becomes of it."""
-        return bool(self.waiting or self.flown)
+        """Return whether any task has no outcome yet."""
+        return bool(self.waiting or self.in_flight)
 
-    def held(self, task: Task) -> bool:
-        """True where a task waits for another in flight."""
-        return any(index in self._flying for index in task.prerequisites)
+    def is_blocked(self, task: Task) -> bool:
+        """Return whether a prerequisite of a task is in flight."""
+        return any(index in self._futures for index in task.prerequisites)
 
-    def submit(self, place: str | None = None) -> InFlight:
-        """Hand out the next unit, to a worker or to any."""
+    def submit(self, worker: str | None = None) -> InFlight:
+        """Submit the next task, preferably to a worker with the given address; None for any worker."""
         product = self.batch.product
-        busy = {one.task.affinity for one in self.flown.values()}
-        # what a worker knows of a kin, the PSFs of a detector for example, it need not find again
-        task = self.waiting.next(self._known.get(place), busy) if place else self.waiting.next()
-        self._tries[task.index] += 1
-        # an edge of the graph for each unit that it comes after and that is not there yet
-        after = [self._flying[k] for k in task.prerequisites if k in self._flying]
-        where: dict[str, Any] = {"workers": [place], "allow_other_workers": True} if place else {}
+        busy = {sent.task.affinity for sent in self.in_flight.values()}
+        # a worker reuses its cache, for example the PSFs of a detector, for tasks of the same affinity key
+        task = self.waiting.next(self._last_affinity.get(worker), busy) if worker else self.waiting.next()
+        self._attempts[task.index] += 1
+        # the futures of prerequisites in flight are dependencies of the task
+        prerequisites = [self._futures[k] for k in task.prerequisites if k in self._futures]
+        preference: dict[str, Any] = {"workers": [worker], "allow_other_workers": True} if worker else {}
         future = self._client.submit(
             make_unit,
             self._product,
             task,
             self.batch.store,
-            *after,
+            *prerequisites,
             key=f"{self._name}-{product.names[task.index]}-{self._token}-{next(self._number)}",
             pure=False,
             priority=-self.batch.rank,
-            **where,
+            **preference,
         )
-        self._flying[task.index] = future
-        self.flown[future] = InFlight(task, place)
-        if place:
-            self._known[place] = task.affinity
-        future.add_done_callback(self._ended)
-        return self.flown[future]
+        self._futures[task.index] = future
+        self.in_flight[future] = InFlight(task, worker)
+        if worker:
+            self._last_affinity[worker] = task.affinity
+        future.add_done_callback(self._on_end)
+        return self.in_flight[future]
 
     def settle(self, future: Any) -> list[Outcome]:
-        """Return what became of the unit of a future that has ended, and of those given up with it."""
+        """Process a future that has ended.
+
+        Returns
+        -------
+        list of Outcome
+            Outcome of its task, and of the tasks that are skipped because it failed. Empty if the task is tried again.
+        """
         product, waiting = self.batch.product, self.waiting
-        task = self.flown.pop(future).task
-        del self._flying[task.index]
+        task = self.in_flight.pop(future).task
+        del self._futures[task.index]
         outcomes = []
-        lost = self._failed.intersection(task.prerequisites)
+        failed_prerequisites = self._failed.intersection(task.prerequisites)
         if future.status == "finished":
-            self._missing.discard(task.index)
+            self._not_made.discard(task.index)
             outcomes = [Outcome(product.stage, task.index, future.result())]
-        elif self._missing.intersection(task.prerequisites) and not lost:
-            # it failed with one that it waited for, not by itself
-            self._tries[task.index] -= 1
+        elif self._not_made.intersection(task.prerequisites) and not failed_prerequisites:
+            # dask marks it as failed because a prerequisite failed in this attempt: not counted as an attempt
+            self._attempts[task.index] -= 1
             waiting.again(task)
-        elif self._tries[task.index] < ATTEMPTS and not lost:
+        elif self._attempts[task.index] < ATTEMPTS and not failed_prerequisites:
             waiting.again(task)
         else:
-            text = after_failed(product, min(lost)) if lost else _failure(future)
+            text = (
+                failed_prerequisite_text(product, min(failed_prerequisites))
+                if failed_prerequisites
+                else _failure_text(future)
+            )
             error = future.exception() if future.status == "error" else None
-            others = given_up(product, task.index, waiting.give_up(task.index))
-            outcomes = [Outcome(product.stage, task.index, None, text, error), *others]
+            skipped = skipped_outcomes(product, task.index, waiting.give_up(task.index))
+            outcomes = [Outcome(product.stage, task.index, None, text, error), *skipped]
             self._failed |= {outcome.index for outcome in outcomes}
         future.release()
         return outcomes
 
 
-def submit_units(waves: Sequence[Submission], threads: dict[str, int]) -> None:
-    """Hand out as much as workers should hold: of a wave nothing while one before it has units that could begin.
+def submit_units(submissions: Sequence[Submission], threads: dict[str, int]) -> None:
+    """Submit tasks until the workers have enough.
+
+    Tasks of a later stage are submitted only when no task of an earlier stage can start.
 
     Parameters
     ----------
-    threads : of each worker, by address
+    submissions : sequence of Submission
+        Submissions, earlier stages first.
+    threads : dict of str to int
+        Number of threads of each worker, by address.
     """
     total = max(1, sum(threads.values()))
-    # those that wait for others in flight keep nobody busy
-    able = [(wave, one) for wave in waves for one in wave.flown.values() if not wave.held(one.task)]
-    room = IN_FLIGHT_PER_THREAD * total - len(able)
-    free = total - sum(wave.long for wave, _ in able)
-    places = Counter(one.place for wave in waves for one in wave.flown.values() if one.place)
-    for wave in waves:
-        held = sum(wave.held(one.task) for one in wave.flown.values())
-        while wave.waiting and held < IN_FLIGHT_PER_THREAD * total:
-            if room <= 0 or (wave.long and free <= 0):
+    # tasks that wait for prerequisites in flight occupy no thread
+    unblocked = [
+        (submission, sent)
+        for submission in submissions
+        for sent in submission.in_flight.values()
+        if not submission.is_blocked(sent.task)
+    ]
+    room = IN_FLIGHT_PER_THREAD * total - len(unblocked)
+    free = total - sum(submission.long for submission, _ in unblocked)
+    sent_to = Counter(
+        sent.worker for submission in submissions for sent in submission.in_flight.values() if sent.worker
+    )
+    for submission in submissions:
+        blocked = sum(submission.is_blocked(sent.task) for sent in submission.in_flight.values())
+        while submission.waiting and blocked < IN_FLIGHT_PER_THREAD * total:
+            if room <= 0 or (submission.long and free <= 0):
                 return
-            place = min(threads, key=lambda one: places[one] / max(1, threads[one]), default=None)
-            sent = wave.submit(place if wave.long else None)
-            if sent.place:
-                places[sent.place] += 1
-            if wave.held(sent.task):
-                held += 1
+            worker = min(threads, key=lambda address: sent_to[address] / max(1, threads[address]), default=None)
+            sent = submission.submit(worker if submission.long else None)
+            if sent.worker:
+                sent_to[sent.worker] += 1
+            if submission.is_blocked(sent.task):
+                blocked += 1
             else:
-                room, free = room - 1, free - wave.long
+                room, free = room - 1, free - submission.long
 
 
-def _itself(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:
+def _identity(product: ImageProduct | TableProduct) -> ImageProduct | TableProduct:
     return product
 
 
-def _failure(future: Any) -> str:
+def _failure_text(future: Any) -> str:
     if future.status != "error":
         return f"the task was {future.status}: its worker died, perhaps for want of memory\n"
     error = future.exception()

@@ -1,4 +1,4 @@
-"""In which order tasks are handed out: dear ones first, kin together, and each after those it comes after."""
+"""Order of tasks: most expensive first, tasks with the same affinity key together, prerequisites first."""
 
 from __future__ import annotations
 
@@ -8,58 +8,65 @@ from romandask.engine.task import Task
 
 
 class TaskQueue:
-    """Tasks that wait for their turn.
+    """Tasks of one stage that have not been submitted.
 
-    A task is handed out when all that it comes after have been, so that it can be told to wait for them; when one of
-    those is given up it is given up too.
+    A task is taken only after all its prerequisites have been taken, so that it can be submitted with dependencies on
+    them. A task is removed when one of its prerequisites has failed.
     """
 
     def __init__(self, tasks: Sequence[Task]):
-        self._families: dict[str, list[Task]] = {}
+        self._by_affinity: dict[str, list[Task]] = {}
         for task in sorted(tasks, key=lambda task: (-task.cost, task.affinity, task.index)):
-            self._families.setdefault(task.affinity, []).append(task)
-        for family in self._families.values():
-            # the next one is at the end
-            family.reverse()
-        self._back = {task.index for task in tasks}
+            self._by_affinity.setdefault(task.affinity, []).append(task)
+        for group in self._by_affinity.values():
+            # reversed, so that the next task is popped from the end
+            group.reverse()
+        self._waiting = {task.index for task in tasks}
 
     def __bool__(self) -> bool:
-        return bool(self._back)
+        return bool(self._waiting)
 
-    def next(self, kin: str | None = None, busy: Collection[str] = ()) -> Task:
-        """Take the first task of which nothing that it comes after waits itself.
+    def next(self, affinity: str | None = None, busy: Collection[str] = ()) -> Task:
+        """Take the first task that has no prerequisite in the queue.
 
         Parameters
         ----------
-        kin : whose tasks come first, where there are any
-        busy : kin whose tasks come last
+        affinity : str or None
+            Affinity key whose tasks are taken first.
+        busy : collection of str
+            Affinity keys whose tasks are taken last.
+
+        Raises
+        ------
+        RuntimeError
+            If the prerequisites are circular.
         """
-        names = sorted(self._families, key=lambda name: (name != kin, name in busy))
-        for name in names:
-            family = self._families[name]
-            for place in range(len(family) - 1, -1, -1):
-                if not self._back.intersection(family[place].prerequisites):
-                    task = family.pop(place)
-                    self._back.discard(task.index)
-                    if not family:
-                        del self._families[name]
+        keys = sorted(self._by_affinity, key=lambda key: (key != affinity, key in busy))
+        for key in keys:
+            group = self._by_affinity[key]
+            for position in range(len(group) - 1, -1, -1):
+                if not self._waiting.intersection(group[position].prerequisites):
+                    task = group.pop(position)
+                    self._waiting.discard(task.index)
+                    if not group:
+                        del self._by_affinity[key]
                     return task
-        raise RuntimeError("units that come after one another in a circle")
+        raise RuntimeError("the prerequisites of the units are circular")
 
     def again(self, task: Task) -> None:
-        """Put back a task that was handed out, to be the next of its kin."""
-        self._families.setdefault(task.affinity, []).append(task)
-        self._back.add(task.index)
+        """Put back a task, as the next one of its affinity key."""
+        self._by_affinity.setdefault(task.affinity, []).append(task)
+        self._waiting.add(task.index)
 
     def give_up(self, index: int) -> list[Task]:
-        """Take out the tasks that come after one that has failed, and those after them."""
-        lost, gone = {index}, []
-        waiting = [task for family in self._families.values() for task in family]
-        while found := [task for task in waiting if lost.intersection(task.prerequisites)]:
-            lost |= {task.index for task in found}
-            gone += found
-            waiting = [task for task in waiting if task.index not in lost]
-        kept = {name: [task for task in family if task.index not in lost] for name, family in self._families.items()}
-        self._families = {name: family for name, family in kept.items() if family}
-        self._back -= lost
-        return gone
+        """Remove and return the tasks that depend, directly or indirectly, on the unit number `index`."""
+        skipped, removed = {index}, []
+        waiting = [task for group in self._by_affinity.values() for task in group]
+        while dependents := [task for task in waiting if skipped.intersection(task.prerequisites)]:
+            skipped |= {task.index for task in dependents}
+            removed += dependents
+            waiting = [task for task in waiting if task.index not in skipped]
+        kept = {key: [task for task in group if task.index not in skipped] for key, group in self._by_affinity.items()}
+        self._by_affinity = {key: group for key, group in kept.items() if group}
+        self._waiting -= skipped
+        return removed

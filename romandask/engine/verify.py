@@ -1,4 +1,4 @@
-"""Verify a store: every stored byte against what the manifest says was written."""
+"""Verification of a store: compare the stored bytes with the hashes in the manifest."""
 
 from __future__ import annotations
 
@@ -13,28 +13,33 @@ from romandask.storage.manifest import Record, read_records
 from romandask.storage.paths import remove, remove_folder
 from romandask.storage.store import Store
 
-BESIDE = ("truth/seds", "store")
-"""What is stored beside the units of stages: the library of spectra, and settings and versions."""
+OTHER_FILES = ("truth/seds", "store")
+"""Names of the checksums of files that belong to no unit: the spectral library, and settings with versions."""
 
 
 @dataclass(frozen=True)
 class Verified:
-    """What was found of one stage."""
+    """Result of the verification of one stage."""
 
     stage: str
+    """Name of the stage, or one of `OTHER_FILES`."""
     units: int
-    """With a record."""
+    """Number of units with a record."""
     damaged: tuple[tuple[str, str], ...]
-    """Units, and files beside them, that are not as they were written, each with what was found."""
+    """Name and damage of each unit or metadata file whose content differs from what was written."""
 
 
 def verify(stages: list[RunnableStage], store: Store, only: str | None = None) -> Iterator[Verified]:
-    """Yield, stage by stage, how many units are stored and which are not as they were written. Nothing is changed.
+    """Yield, for each stored stage, the number of units and the damaged units. Nothing is changed.
 
     Parameters
     ----------
+    stages : list of RunnableStage
+        Stages of the survey.
+    store : Store
+        The store to read.
     only : str or None
-        Name of one stage's product, or of one of `BESIDE`; None for all.
+        Name of one stage, or one of `OTHER_FILES`; None for all.
     """
     for stage in stages:
         if only is not None and stage.name != only:
@@ -45,29 +50,29 @@ def verify(stages: list[RunnableStage], store: Store, only: str | None = None) -
         product, damaged = stage.product(), []
         numbers = {name: index for index, name in enumerate(product.names)}
         for name, record in records.items():
-            why = _damage(product, store, numbers, name, record)
-            if why is not None:
-                damaged.append((name, why))
+            damage = _damage(product, store, numbers, name, record)
+            if damage is not None:
+                damaged.append((name, damage))
         yield Verified(stage.name, len(records), tuple(damaged + damaged_files(store, stage.name)))
-    for name in BESIDE:
+    for name in OTHER_FILES:
         if only in (None, name):
             yield Verified(name, 0, tuple(damaged_files(store, name)))
 
 
 def forget(store: Store, verified: Verified) -> None:
-    """Remove the records of the damaged units of a stage, so that the next run makes them again.
+    """Remove the records of the damaged units of a stage, so that the next run makes these units again.
 
-    Where metadata beside the units of an image product is damaged, the content of its arrays is no longer certain: the
-    records of all its units are removed.
+    If metadata of an image product is damaged, the content of its arrays is uncertain: the arrays and the records of
+    all units are removed.
     """
-    beside = {name for name, _ in damaged_files(store, verified.stage)}
+    metadata = {name for name, _ in damaged_files(store, verified.stage)}
     for name, _ in verified.damaged:
-        if name not in beside:
+        if name not in metadata:
             remove(store.record(verified.stage, name))
-    if not beside:
+    if not metadata:
         return
     remove_checksums(store, verified.stage)
-    for name in beside:
+    for name in metadata:
         remove(store.root / name)
     if store.images(verified.stage).exists():
         remove_folder(store.images(verified.stage))
@@ -79,7 +84,7 @@ def forget(store: Store, verified: Verified) -> None:
 def _damage(
     product: ImageProduct | TableProduct, store: Store, numbers: dict[str, int], name: str, record: Record | None
 ) -> str | None:
-    """Return what is wrong with a unit; None where nothing is."""
+    """Return a description of the damage of a unit, or None if it is intact."""
     if record is None:
         return f"{store.record(product.stage, name)}: the record is damaged"
     if name not in numbers:
@@ -87,6 +92,6 @@ def _damage(
     try:
         output = product.verify(numbers[name], store)
     except Exception as error:
-        # whatever a decoder makes of damaged bytes
+        # a decoder of damaged bytes can raise anything
         return f"cannot be read ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})"
     return None if output == record.output else "not what was written"

@@ -9,11 +9,10 @@ import typer
 
 from romandask.storage.paths import parse_path
 
-Source = Annotated[
-    str, typer.Argument(metavar="PIPELINE", help="A YAML file, or the name of a pipeline that came with the package.")
-]
+Source = Annotated[str, typer.Argument(metavar="PIPELINE", help="YAML file, or name of a pipeline of the package.")]
 Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings, for example coadds.pixfrac=0.8.")
+    list[str] | None,
+    typer.Argument(metavar="KEY=VALUE", help="Settings that override the pipeline, for example coadds.pixfrac=0.8."),
 ]
 StoreArgument = Annotated[
     Any, typer.Argument(metavar="STORE", parser=parse_path, help="Folder of the store, or s3://BUCKET/FOLDER.")

@@ -1,1 +1,1 @@
-"""Pages that show a stored survey: the report, the sky viewer, the stage diagram, the data-product reference."""
+"""Pages about a survey: the report, the sky viewer, the stage diagram and the data-product reference."""

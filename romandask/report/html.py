@@ -1,4 +1,4 @@
-"""Parts of an HTML page: pictures that lie in it, and tables."""
+"""HTML elements of the report: embedded pictures and tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pandas as pd
 
 
 def image_of(png: bytes, caption: str) -> str:
-    """Return a picture with its caption."""
+    """Return an HTML figure with an embedded PNG picture and its caption."""
     data = base64.b64encode(png).decode()
     text = html.escape(caption)
     image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
@@ -17,5 +17,5 @@ def image_of(png: bytes, caption: str) -> str:
 
 
 def table_of(frame: pd.DataFrame) -> str:
-    """Return a table."""
+    """Return an HTML table of a data frame, without its index."""
     return frame.to_html(index=False, border=0)

@@ -1,4 +1,4 @@
-"""The report: one HTML page without external assets."""
+"""Report of a survey: one HTML page without external assets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from romandask.model.spectra import ab_magnitude
-from romandask.report import figures
+from romandask.report import figures, pictures
 from romandask.report.html import image_of, table_of
 from romandask.report.joint import blends, difference_images, field
 from romandask.run import run_figures, stored_versions
@@ -29,7 +29,7 @@ th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align
 
 
 def write_report(survey: Survey) -> AnyPath:
-    """Write the page of a stored survey and return where it is."""
+    """Write the report of a stored survey to its store and return the path of the page."""
     assert survey.store is not None
     objects = {name: survey.output(f"objects/{name}").all_rows() for name in survey.instruments}
     busiest = _busiest_tile(survey, objects)
@@ -43,7 +43,7 @@ def write_report(survey: Survey) -> AnyPath:
         field(survey, objects, busiest),
         difference_images(survey),
         _lensing(survey),
-        _figures_of_the_run(survey),
+        _run_statistics(survey),
     ]
     title = html.escape(f"romandask: {survey.pipeline.name}")
     page = (
@@ -85,28 +85,28 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
             bands[band] = arrays["image"]
             if position == len(instrument.bands) // 2:
                 layers[name] = (arrays["weight"], arrays["nimages"], band)
-        pairs[name] = figures.TileImages(bands, instrument.picture_bands, instrument.coadd_scale)
+        pairs[name] = pictures.TileImages(bands, instrument.picture_bands, instrument.coadd_scale)
     label = survey.tiles[tile].name
     circled = {name: frame[frame["tile"] == label] for name, frame in objects.items()}
     return (
         "<h2>The same sky</h2>"
         + image_of(
-            figures.colour_pair(pairs, circled),
+            pictures.colour_pair(pairs, circled),
             f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
         )
-        + image_of(figures.maps(layers), "Weight and number of exposures of the tile.")
+        + image_of(pictures.coverage_maps(layers), "Weight and number of exposures of the tile.")
     )
 
 
 def _detector(survey: Survey) -> str:
-    """Return what each effect of the detectors does, where they are modelled in full."""
+    """Return the section on the effects of detectors that are modelled in full."""
     text = ""
     for name, instrument in survey.instruments.items():
         if not instrument.calibrated:
             continue
         exposures = survey.output(f"exposures/{name}")
         earlier, table = exposures.renderer.readout.earlier, exposures.table
-        # an exposure with an afterglow, if there is one
+        # prefer an exposure with an afterglow of earlier exposures
         index = next((row for row in range(len(table)) if len(earlier(table, row))), 0)
         text += "<h2>The detectors</h2>" + image_of(
             figures.effects(exposures.effects(index)),
@@ -139,7 +139,9 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     truth = [catalogs.galaxies.all_rows(), catalogs.stars.all_rows()]
     truth = [frame[survey.region.contains(frame["ra"], frame["dec"])] for frame in truth]
     true, measured, middle, colours = {}, {}, {}, {}
-    depth = {band: value for name in objects for band, value in depths(objects[name], survey.bands(name)).items()}
+    depth = {
+        str(band): float(value) for name in objects for band, value in depths(objects[name], survey.bands(name)).items()
+    }
     matched = {name: survey.output(f"truth_match/{name}").all_rows() for name in objects}
     joined = {
         name: with_truth(frame, matched[name], survey.output(f"truth_summary/{name}").all_rows())
@@ -153,10 +155,10 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
             measured[band] = ab_magnitude(frame[f"{band}_kronFlux"])
         for pair in pairwise(bands):
             colours[" - ".join(pair)] = colours_of(joined[name], *pair)
-    found = {name: residuals(frame, survey.bands(name)) for name, frame in joined.items()}
+    residual_tables = {name: residuals(frame, survey.bands(name)) for name, frame in joined.items()}
     return (
         "<h2>Measurements</h2>"
-        + _beside_the_paper(survey, objects, joined, depth)
+        + _comparison_with_paper(survey, objects, joined, depth)
         + image_of(
             figures.magnitude_histograms(true, measured, depth),
             "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
@@ -175,7 +177,7 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
             "Size and magnitude; point sources form the locus at the PSF's size.",
         )
         + image_of(
-            figures.residuals(found),
+            figures.residuals(residual_tables),
             "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
             "their errors (pulls), median and scatter; and the share of objects that are flagged.",
         )
@@ -191,19 +193,21 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
     )
 
 
-def _beside_the_paper(
+def _comparison_with_paper(
     survey: Survey, objects: dict[str, pd.DataFrame], joined: dict[str, pd.DataFrame], depth: dict[str, float]
 ) -> str:
-    """Return depths, densities and flags beside those of Troxel et al. (2023)."""
+    """Return a table of depths, densities and flagged shares with the values of Troxel et al. (2023)."""
     degrees = survey.region.area / 3600
     rows = []
     for name, frame in objects.items():
         published = survey.instruments[name].publication
         stars = joined[name]["star"].to_numpy(bool)
-        for kind, count in (("galaxies", int((~stars).sum())), ("stars", int(stars.sum()))):
-            paper = None if published is None else {"galaxies": published.galaxies, "stars": published.stars}[kind]
+        for population, count in (("galaxies", int((~stars).sum())), ("stars", int(stars.sum()))):
+            paper = (
+                None if published is None else {"galaxies": published.galaxies, "stars": published.stars}[population]
+            )
             rows.append(
-                (f"{name}: detected {kind} / deg2", f"{count / degrees:,.0f}", f"{paper:,.0f}" if paper else "")
+                (f"{name}: detected {population} / deg2", f"{count / degrees:,.0f}", f"{paper:,.0f}" if paper else "")
             )
         rows.append((f"{name}: flagged objects", f"{(frame['flags'] != 0).mean():.1%}" if len(frame) else "", ""))
         for band in survey.bands(name):
@@ -245,7 +249,7 @@ def _lensing(survey: Survey) -> str:
     )
 
 
-def _figures_of_the_run(survey: Survey) -> str:
+def _run_statistics(survey: Survey) -> str:
     assert survey.store is not None
     table = pd.DataFrame(run_figures(survey.store))
     shown = pd.DataFrame(
@@ -269,6 +273,7 @@ def _figures_of_the_run(survey: Survey) -> str:
 
 
 def _busiest_tile(survey: Survey, objects: dict[str, pd.DataFrame]) -> int:
+    """Return the number of the tile with the most detected objects."""
     names = [tile.name for tile in survey.tiles]
-    counts = sum(frame["tile"].value_counts().reindex(names, fill_value=0) for frame in objects.values())
-    return names.index(counts.idxmax())
+    counts = [frame["tile"].value_counts().reindex(names, fill_value=0).to_numpy() for frame in objects.values()]
+    return int(np.argmax(np.sum(counts, axis=0)))

@@ -1,4 +1,4 @@
-"""The data-product reference: every table and image that a survey can hold, as Markdown, from what the code writes."""
+"""Reference of the data products: every table and image of a store, as Markdown generated from the code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "with `roman.detector: sca`": ("roman.detector=sca",),
     "with `rubin.mode: visits`": ("rubin.mode=visits",),
 }
-"""Settings of the pipeline `tiny` that change which images there are, by how they are told."""
+"""Overrides of the pipeline `tiny` that change the set of images, by their description in the reference."""
 _HEAD = """# Data products
 
 What a store holds, table by table and image by image. `romandask reference` writes this page, from the schemas beside
@@ -26,7 +26,7 @@ it and from the products themselves; a test holds the two together. Sizes of axe
 
 
 def reference() -> str:
-    """Return the page."""
+    """Return the reference of all data products as Markdown."""
     tables = [_table(path.stem, read_yaml(path)) for path in sorted(resource_folder("catalogs").glob("*.yaml"))]
     return _HEAD + "# Tables\n\n" + "\n".join(tables) + "\n# Images\n\n" + "\n".join(_images())
 
@@ -41,38 +41,39 @@ def _table(name: str, content: dict[str, Any]) -> str:
 
 
 def _images() -> list[str]:
-    """Return the sections of all image products; one that settings change has a section for each."""
-    found: dict[str, str] = {}
+    """Return the sections of all image products; a product that depends on the overrides has a section for each."""
+    sections: dict[str, str] = {}
     for text, overrides in VARIANTS.items():
         survey = Survey(load_pipeline("tiny", list(overrides)))
-        for one in stage_products(survey):
-            product = survey.product(one.name)
+        for stage_product in stage_products(survey):
+            product = survey.product(stage_product.name)
             if isinstance(product, ImageProduct):
                 section = _image(product)
-                if section not in found:
-                    found[section] = f"## {product.stage}{f' ({text})' if text else ''}\n\n{section}"
+                if section not in sections:
+                    sections[section] = f"## {product.stage}{f' ({text})' if text else ''}\n\n{section}"
         psfs = {f"psfs/{name}": survey.output(f"psfs/{name}") for name in survey.instruments} if not overrides else {}
         for name, product in psfs.items():
-            found.setdefault(_image(product), f"## {name} (made on demand, not stored)\n\n{_image(product)}")
-    return sorted(found.values())
+            sections.setdefault(_image(product), f"## {name} (made on demand, not stored)\n\n{_image(product)}")
+    return sorted(sections.values())
 
 
 def _image(product: ImageProduct) -> str:
     rows = []
     for variable in product.variables:
         axes = [*product.axes, *(f"{axis} {size}" for axis, size in zip(variable.axes, variable.shape, strict=True))]
-        about = dict(variable.attributes)
-        text = str(about.get("long_name", ""))
-        if "flag_masks" in about:
-            names = zip(about["flag_masks"], str(about["flag_meanings"]).split(), strict=True)
+        attributes = dict(variable.attributes)
+        text = str(attributes.get("long_name", ""))
+        if "flag_masks" in attributes:
+            names = zip(attributes["flag_masks"], str(attributes["flag_meanings"]).split(), strict=True)
             text += ": " + ", ".join(f"{mask} {name}" for mask, name in names)
-        rows.append((f"`{variable.name}`", variable.dtype, ", ".join(axes), about.get("units"), text))
+        rows.append((f"`{variable.name}`", variable.dtype, ", ".join(axes), attributes.get("units"), text))
     tables = "".join(f"Beside it, a table a unit: `{name}`.\n\n" for name in product.tables)
     return tables + _rows(("variable", "type", "axes", "unit", "what it is"), rows)
 
 
 def _rows(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    # a bar would end the cell
+    """Return a Markdown table."""
+    # an unescaped | would end the cell
     lines = [head, ("---",) * len(head), *rows]
     cells = [["" if cell is None else str(cell).replace("|", "\\|") for cell in line] for line in lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"

@@ -1,7 +1,7 @@
-"""An atlas: the coadds of all surveys as one page to drag and zoom in, with its pictures and without external assets.
+"""Sky viewer: the coadds of all surveys as one page to drag and zoom, without external assets.
 
-The pictures of a survey are a pyramid over one gnomonic plane about the middle of the region, north up, east left; a
-picture of a level shows what four of the level below show. A place of the plane has the pixel of the tile that owns it.
+The pictures of a survey are a pyramid on one gnomonic plane at the centre of the region, north up, east left. A picture
+of a level covers four pictures of the level below. A position of the plane shows the pixel of the tile that owns it.
 """
 
 from __future__ import annotations
@@ -21,42 +21,43 @@ from romandask.export.files import make_folder
 from romandask.model.errors import UserError
 from romandask.model.sky import from_tangent_plane
 from romandask.model.tiles import tangent_header
-from romandask.report.figures import coloured, noise_of, three_of
+from romandask.report.pictures import noise_of, rgb_bands, rgb_picture
 from romandask.stages.coadds.tile_maker import Coadds
 from romandask.storage.paths import write_bytes
 from romandask.survey import Survey
 
 PICTURE_PIXELS = 512
-"""Pixels a side of a picture."""
-WIDEST = 40.0
-"""Degrees that one gnomonic plane shows well."""
-_SAMPLE = 1024
-"""Pixels a side of the middle of a tile that tells a band's noise."""
+"""Side of a picture, pixels."""
+MAX_WIDTH = 40.0
+"""Largest extent of a region that one gnomonic plane shows without strong distortion, degrees."""
+_NOISE_SAMPLE = 1024
+"""Side of the central part of a tile from which the noise of a band is measured, pixels."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plane:
-    """The plane of the atlas; its pixels are those of the finest survey."""
+    """Tangent plane of the viewer; its pixels have the size of the smallest coadd pixels of all surveys."""
 
     ra: float
-    """Centre, degrees."""
+    """Right ascension of the centre, degrees."""
     dec: float
-    """Centre, degrees."""
+    """Declination of the centre, degrees."""
     scale: float
-    """Arcsec a pixel."""
+    """Pixel scale, arcsec."""
     width: int
-    """Pixels, east to west."""
+    """Extent from east to west, pixels."""
     height: int
-    """Pixels, north to south."""
+    """Extent from north to south, pixels."""
     side: int = PICTURE_PIXELS
+    """Side of a picture, pixels."""
 
     @property
     def top(self) -> int:
-        """The level at which one picture shows all."""
+        """Level at which one picture covers the whole plane."""
         return max(0, int(np.ceil(np.log2(max(self.width, self.height) / self.side))))
 
     def sky(self, level: int, row: int, column: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return right ascension and declination (side, side), degrees, of the pixels of a picture."""
+        """Return right ascension and declination of the pixels of a picture, each of shape (side, side), degrees."""
         step = 2**level
         x = (np.arange(column * self.side, (column + 1) * self.side) + 0.5) * step - self.width / 2
         y = (np.arange(row * self.side, (row + 1) * self.side) + 0.5) * step - self.height / 2
@@ -65,66 +66,79 @@ class Plane:
 
 @dataclass(frozen=True)
 class Layer:
-    """The coadds of one survey, as colours."""
+    """Colour pictures of the coadds of one survey."""
 
     coadds: Coadds
     plane: Plane
 
     @cached_property
     def bands(self) -> tuple[str, ...]:
-        """The bands that are red, green and blue."""
-        return three_of(self.coadds.instrument.picture_bands)
+        """Red, green and blue band."""
+        return rgb_bands(self.coadds.instrument.picture_bands)
 
     @property
     def finest(self) -> int:
-        """The lowest level: finer pictures would show a pixel as several."""
+        """Lowest level of the pyramid: at a lower one, a coadd pixel would cover several picture pixels."""
         return max(0, int(np.floor(np.log2(self.coadds.instrument.coadd_scale / self.plane.scale) + 1e-6)))
 
     @cached_property
     def numbers(self) -> dict[int, int]:
-        """Numbers of the tiles of which all three bands are stored, by their ids."""
-        found = {tile.id: number for number, tile in enumerate(self.coadds.tiles)}
-        return {key: k for key, k in found.items() if all(self.coadds.has(self.unit(k, b)) for b in self.bands)}
+        """Numbers of the tiles whose three bands are stored, by tile id."""
+        numbers = {tile.id: number for number, tile in enumerate(self.coadds.tiles)}
+        return {key: k for key, k in numbers.items() if all(self.coadds.has(self.unit(k, b)) for b in self.bands)}
 
     @cached_property
     def noise(self) -> dict[str, float]:
-        """Scatter of the sky by band, from the middle of a tile."""
+        """Noise of the sky by band, from the centre of the middle tile."""
         middle = sorted(self.numbers.values())[len(self.numbers) // 2]
-        first = max(0, (self.coadds.pixels - _SAMPLE) // 2)
-        window = (slice(first, first + _SAMPLE),) * 2
+        first = max(0, (self.coadds.pixels - _NOISE_SAMPLE) // 2)
+        window = (slice(first, first + _NOISE_SAMPLE),) * 2
         return {b: noise_of(self.coadds.load(self.unit(middle, b), ("image",), window)["image"]) for b in self.bands}
 
     def unit(self, tile: int, band: str) -> int:
-        """Return the number of the unit of a tile and band."""
+        """Return the unit number of a tile and band."""
         return self.coadds.index(tile, band)
 
     def sampled(self, row: int, column: int) -> np.ndarray:
-        """Return a picture (3, side, side) of the finest level in units of the noise; NaN where nothing is."""
+        """Return a picture of the lowest level in units of the noise.
+
+        Returns
+        -------
+        ndarray, shape (3, side, side)
+            Red, green and blue plane; NaN where no tile has data.
+        """
         ra, dec = self.plane.sky(self.finest, row, column)
         owners = self.coadds.settings.grid().owner(ra, dec)
         out = np.full((3, *ra.shape), np.nan, np.float32)
         for owner in np.unique(owners).tolist():
             if owner not in self.numbers:
                 continue
-            here = owners == owner
+            owned = owners == owner
             tile = self.numbers[owner]
-            x, y = (np.rint(v).astype(int) for v in self.coadds.wcs(tile).wcs_world2pix(ra[here], dec[here], 0))
+            x, y = (np.rint(v).astype(int) for v in self.coadds.wcs(tile).wcs_world2pix(ra[owned], dec[owned], 0))
             inside = (x >= 0) & (y >= 0) & (x < self.coadds.pixels) & (y < self.coadds.pixels)
             if not inside.any():
                 continue
-            x, y, places = x[inside], y[inside], np.flatnonzero(here)[inside]
+            x, y, pixels = x[inside], y[inside], np.flatnonzero(owned)[inside]
             window = slice(y.min(), y.max() + 1), slice(x.min(), x.max() + 1)
-            # where there are few bands one is two colours, and read once
+            # a band that is used for several colours is read once
             for band, noise in self.noise.items():
-                found = self.coadds.load(self.unit(tile, band), ("image", "weight"), window)
-                values = np.where(found["weight"] > 0, found["image"] / noise, np.nan)
+                arrays = self.coadds.load(self.unit(tile, band), ("image", "weight"), window)
+                values = np.where(arrays["weight"] > 0, arrays["image"] / noise, np.nan)
                 for plane in (plane for plane, name in zip(out, self.bands, strict=True) if name == band):
-                    plane.flat[places] = values[y - window[0].start, x - window[1].start]
+                    plane.flat[pixels] = values[y - window[0].start, x - window[1].start]
         return out
 
 
 def write_sky_viewer(survey: Survey, folder: Path) -> Path:
-    """Write a page of a survey's coadds, and its pictures, and return where it is.
+    """Write the viewer page of a survey and its pictures, and return the path of the page.
+
+    Parameters
+    ----------
+    survey : Survey
+        Survey with stored coadds.
+    folder : Path
+        Destination.
 
     Raises
     ------
@@ -143,7 +157,7 @@ def write_sky_viewer(survey: Survey, folder: Path) -> Path:
         shown.append({"name": name, "finest": layer.finest, "bands": list(dict.fromkeys(layer.bands))})
     content = {"name": survey.pipeline.name, "top": plane.top, "surveys": shown} | asdict(plane)
     page = (Path(__file__).parent / "sky_viewer.html").read_text()
-    # in a script </ would end it
+    # </ would end the script element
     data = json.dumps(content).replace("</", "<\\/")
     write_bytes(folder / "index.html", page.replace("/*ATLAS*/null", data).encode())
     return folder / "index.html"
@@ -155,17 +169,23 @@ def _plane(survey: Survey) -> Plane:
     scale = min(instrument.coadd_scale for instrument in survey.instruments.values())
     corners = np.concatenate([tile.corners(grid.inner) for tile in survey.tiles])
     extent = max(region.width * np.cos(np.radians(dec)), region.dec_max - region.dec_min)
-    if extent > WIDEST:
-        raise UserError(f"the region is {extent:.0f} degrees wide, one page shows {WIDEST:.0f}: run a part of it")
+    if extent > MAX_WIDTH:
+        raise UserError(f"the region is {extent:.0f} degrees wide, one page shows {MAX_WIDTH:.0f}: run a part of it")
     frame = WCS(tangent_header(ra % 360, dec, 1, scale))
     x, y = frame.wcs_world2pix(corners[:, 0], corners[:, 1], 0)
-    # the tiles need not lie evenly about the middle of the region
+    # the plane is symmetric about the centre of the region, the tiles may not be
     width, height = (2 * int(np.ceil(np.abs(v).max())) for v in (x, y))
-    return Plane(ra % 360, dec, scale, width, height)
+    return Plane(ra=ra % 360, dec=dec, scale=scale, width=width, height=height)
 
 
 def _pictures(layer: Layer, folder: Path, level: int, row: int, column: int) -> np.ndarray | None:
-    """Write a picture and all below it; return its planes (3, side, side), None where nothing is."""
+    """Write a picture and all pictures of lower levels in it.
+
+    Returns
+    -------
+    ndarray, shape (3, side, side), or None
+        Planes of the picture in units of the noise; None if it has no data.
+    """
     plane, side = layer.plane, layer.plane.side
     if row * side * 2**level >= plane.height or column * side * 2**level >= plane.width:
         return None
@@ -185,20 +205,20 @@ def _pictures(layer: Layer, folder: Path, level: int, row: int, column: int) -> 
 
 
 def _halved(planes: np.ndarray) -> np.ndarray:
-    """Return planes of half the side, each pixel the mean of those of four that are there."""
-    three, height, width = planes.shape
-    parts = planes.reshape(three, height // 2, 2, width // 2, 2)
-    there = np.isfinite(parts)
-    count = there.sum(axis=(2, 4))
-    total = np.where(there, parts, 0).sum(axis=(2, 4))
+    """Return planes of half the side; each pixel is the mean of the finite ones of four pixels."""
+    colours, height, width = planes.shape
+    parts = planes.reshape(colours, height // 2, 2, width // 2, 2)
+    finite = np.isfinite(parts)
+    count = finite.sum(axis=(2, 4))
+    total = np.where(finite, parts, 0).sum(axis=(2, 4))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
 def _jpeg(planes: np.ndarray) -> bytes:
-    there = np.isfinite(planes).all(axis=0)
-    picture = coloured(np.nan_to_num(planes))
-    # what is not there is as the page behind it
-    picture[~there] = (16, 18, 24)
+    finite = np.isfinite(planes).all(axis=0)
+    picture = rgb_picture(np.nan_to_num(planes))
+    # pixels without data have the colour of the page
+    picture[~finite] = (16, 18, 24)
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "JPEG", quality=90, subsampling=0)
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""The picture of the stages: what each kind is made from, and how many units of it there are."""
+"""Diagram of the stages: which stages each stage reads, and its number of units."""
 
 from __future__ import annotations
 
@@ -13,87 +13,92 @@ from romandask.stage_graph import StageProduct, stage_products
 from romandask.survey import Survey
 
 
-def dag_svg(survey: Survey, rows: list[PlannedStage], path: Path) -> None:
-    """Write the stages of a survey as an SVG picture: a box a kind with its units, arrows from what it is made from.
+def write_stage_diagram(survey: Survey, rows: list[PlannedStage], path: Path) -> None:
+    """Write a diagram of the stages of a survey to an SVG file.
+
+    Each kind of stage (the first part of the names) is a box that lists its stages and their numbers of units. Arrows
+    point to it from the kinds that it reads directly.
 
     Parameters
     ----------
     survey : Survey
+        The survey.
     rows : list of PlannedStage
-        The survey's plan.
+        Plan of the survey.
     path : Path
-        The SVG file.
+        Destination.
     """
     lines: dict[str, list[str]] = {}
     for row in rows:
         kind, part = row.stage.split("/")
         lines.setdefault(kind, [kind]).append(f"{part}: {row.units}")
-    arrows = _reduced(kinds_read(stage_products(survey)))
+    sources = _reduced(kinds_read(stage_products(survey)))
     columns: dict[int, list[str]] = {}
     for kind in lines:
-        columns.setdefault(_column(kind, arrows), []).append(kind)
+        columns.setdefault(_column(kind, sources), []).append(kind)
     figure = Figure(figsize=(2.2 * len(columns), 1 + 2.2 * max(map(len, columns.values()))), layout="constrained")
     axes = figure.add_subplot()
-    boxes = {}
+    positions: dict[str, tuple[float, float]] = {}
     for column, kinds in columns.items():
-        for place, kind in enumerate(kinds):
-            boxes[kind] = column, (len(kinds) - 1) / 2 - place
-    _draw(axes, {kind: "\n".join(text) for kind, text in lines.items()}, boxes, arrows)
+        for row_number, kind in enumerate(kinds):
+            positions[kind] = column, (len(kinds) - 1) / 2 - row_number
+    _draw(axes, {kind: "\n".join(text) for kind, text in lines.items()}, positions, sources)
     axes.set_xlim(-0.6, len(columns) - 0.4)
-    reach = max(map(len, columns.values())) / 2
-    axes.set_ylim(-reach, reach)
+    half_height = max(map(len, columns.values())) / 2
+    axes.set_ylim(-half_height, half_height)
     axes.set_axis_off()
-    # text stays text, so that it can be searched and read aloud
+    # text is written as text, not as paths, for search and screen readers
     with rc_context({"svg.fonttype": "none"}):
         figure.savefig(path, format="svg")
 
 
 def kinds_read(products: list[StageProduct]) -> dict[str, set[str]]:
-    """Return, by kind of stage, the kinds that it is made from, or whose content decides which units it has."""
-    arrows: dict[str, set[str]] = {}
-    for one in products:
-        sources = {name.split("/")[0] for name in one.reads | one.known_after}
-        arrows.setdefault(one.kind, set()).update(sources - {one.kind})
-    return arrows
+    """Return, for each kind of stage, the kinds that it reads or whose content determines its units."""
+    sources: dict[str, set[str]] = {}
+    for product in products:
+        kinds = {name.split("/")[0] for name in product.reads | product.known_after}
+        sources.setdefault(product.kind, set()).update(kinds - {product.kind})
+    return sources
 
 
-def _reduced(arrows: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Leave out the arrows that others make unnecessary."""
+def _reduced(sources: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Return the direct sources of each kind: those that are not also sources of another source."""
 
-    def all_before(kind: str) -> set[str]:
-        return arrows[kind].union(*(all_before(source) for source in arrows[kind]))
+    def ancestors(kind: str) -> set[str]:
+        return sources[kind].union(*(ancestors(source) for source in sources[kind]))
 
     return {
-        kind: {source for source in sources if not any(source in all_before(other) for other in sources)}
-        for kind, sources in arrows.items()
+        kind: {source for source in direct if not any(source in ancestors(other) for other in direct)}
+        for kind, direct in sources.items()
     }
 
 
-def _depth(kind: str, arrows: dict[str, set[str]]) -> int:
-    return 1 + max((_depth(source, arrows) for source in arrows[kind]), default=-1)
+def _depth(kind: str, sources: dict[str, set[str]]) -> int:
+    """Return the length of the longest chain of sources of a kind."""
+    return 1 + max((_depth(source, sources) for source in sources[kind]), default=-1)
 
 
-def _column(kind: str, arrows: dict[str, set[str]]) -> int:
-    """Return how many come before a kind; of one that is made from nothing, just before what is made from it."""
-    users = [_depth(user, arrows) for user, sources in arrows.items() if kind in sources]
-    return min(users) - 1 if users and not arrows[kind] else _depth(kind, arrows)
+def _column(kind: str, sources: dict[str, set[str]]) -> int:
+    """Return the column of a kind: its depth, or for a kind without sources the column before its first reader."""
+    readers = [_depth(reader, sources) for reader, read in sources.items() if kind in read]
+    return min(readers) - 1 if readers and not sources[kind] else _depth(kind, sources)
 
 
 def _draw(
-    axes: Axes, texts: dict[str, str], places: dict[str, tuple[float, float]], arrows: dict[str, set[str]]
+    axes: Axes, texts: dict[str, str], positions: dict[str, tuple[float, float]], sources: dict[str, set[str]]
 ) -> None:
     style = {"boxstyle": "round", "fc": "#e8eef6", "ec": "#45607f"}
     boxes = {
-        kind: axes.text(*places[kind], text, ha="center", va="center", fontsize=9, bbox=style, zorder=2)
+        kind: axes.text(*positions[kind], text, ha="center", va="center", fontsize=9, bbox=style, zorder=2)
         for kind, text in texts.items()
     }
-    for kind, sources in arrows.items():
-        for source in sorted(sources):
+    for kind, direct in sources.items():
+        for source in sorted(direct):
             ends = {"patchA": boxes[source].get_bbox_patch(), "patchB": boxes[kind].get_bbox_patch()}
             axes.annotate(
                 "",
-                places[kind],
-                places[source],
+                positions[kind],
+                positions[source],
                 zorder=1,
                 arrowprops={"arrowstyle": "->", "color": "#45607f", "shrinkA": 0, "shrinkB": 2, **ends},
             )

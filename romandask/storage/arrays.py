@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import zarr
 from zarr.abc.store import ByteRequest
+from zarr.abc.store import Store as ZarrStore
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
@@ -42,7 +43,7 @@ class Variable:
     """False where compression would gain little and slow down every reader; each chunk is then a file of full rows."""
 
 
-class _StrictStore(WrapperStore):
+class _StrictStore(WrapperStore[ZarrStore]):
     """A Zarr store in which a missing chunk is an error; Zarr itself would return zeros, which look like an image."""
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
@@ -131,7 +132,7 @@ def limited_concurrency() -> Any:
     return zarr.config.set({"async.concurrency": 2})
 
 
-def write_array(array: zarr.Array, unit_index: tuple[int, ...], values: np.ndarray) -> None:
+def write_array(array: zarr.Array[Any], unit_index: tuple[int, ...], values: np.ndarray) -> None:
     """Write the values of one unit, one file of its last two axes at a time.
 
     Zarr holds a second copy of the values that it writes, so one file at a time bounds the memory.
@@ -155,7 +156,9 @@ def write_array(array: zarr.Array, unit_index: tuple[int, ...], values: np.ndarr
             array[(*unit_index, *window)] = values[window]
 
 
-def write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict) -> None:
+def write_coordinate(
+    group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict[str, Any]
+) -> None:
     """Write one coordinate array in a single chunk; strings are stored as variable-length UTF-8."""
     text = values.dtype.kind in "OU"
     array = group.create_array(

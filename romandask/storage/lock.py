@@ -7,6 +7,7 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, remove, write_new
@@ -52,7 +53,7 @@ def in_use(root: AnyPath) -> bool:
     return holder.get("host", socket.gethostname()) != socket.gethostname() or _alive(int(holder.get("pid") or 0))
 
 
-def _holder(path: AnyPath) -> dict | None:
+def _holder(path: AnyPath) -> dict[str, Any] | None:
     """Return the process that holds a lock: None if there is no lock, an empty dict if its file cannot be read."""
     try:
         return json.loads(path.read_bytes())
@@ -62,7 +63,7 @@ def _holder(path: AnyPath) -> dict | None:
         return {}
 
 
-def _refuse_or_remove(path: AnyPath, own: dict) -> None:
+def _refuse_or_remove(path: AnyPath, own: dict[str, Any]) -> None:
     holder = _holder(path) or {}
     if holder.get("host", own["host"]) != own["host"]:
         raise UserError(f"{path.parent}: in use by a driver on {holder['host']}; if it is gone, remove {path}")

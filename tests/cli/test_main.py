@@ -1,8 +1,14 @@
-"""A user's mistake is one line, exit code 2, and nothing written."""
+"""Commands: the plan, the ingest, version and completion, and mistakes that end with one line and exit code 2."""
+
+import re
 
 import pyarrow.parquet as pq
 import pytest
-from conftest import command
+from conftest import MINI, command
+from typer.testing import CliRunner
+
+import romandask
+from romandask.cli.main import app
 
 
 @pytest.mark.parametrize(
@@ -30,8 +36,8 @@ def test_a_mistake_is_one_line_with_exit_code_2_and_nothing_written(tmp_path, ar
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_region_without_pointings_and_a_catalog_without_a_column(shared, tmp_path):
-    """Both are known before any work starts."""
+def test_a_region_without_pointings_and_a_catalog_without_a_column_are_refused(shared, tmp_path):
+    """Both are refused before any work starts."""
     path = "roman_obseq/Roman_WAS_obseq_11_1_23.fits"
     done = command(
         "run",
@@ -56,18 +62,42 @@ def test_a_region_without_pointings_and_a_catalog_without_a_column(shared, tmp_p
     assert not (tmp_path / "s").exists()
 
 
-def test_plan_names_every_stage_and_writes_only_the_picture(tmp_path):
+def test_plan_names_every_stage_and_writes_only_the_diagram(tmp_path):
     done = command("plan", "tiny", "--dag", "dag.svg", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for stage in ("truth/galaxies", "exposures/roman", "coadds/rubin", "matches/groups", "statistics/blends"):
         assert stage in done.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["dag.svg"]
-    picture = (tmp_path / "dag.svg").read_text()
+    diagram = (tmp_path / "dag.svg").read_text()
     for text in ("exposures", "roman: 46", "truth_match"):
-        assert f">{text}<" in picture
+        assert f">{text}<" in diagram
 
 
-def test_one_survey_of_a_pipeline_is_planned_alone_with_the_limits_of_both(tmp_path):
+def test_plan_shows_all_numbers_on_a_narrow_terminal(tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    done = command("plan", "tiny", *MINI, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 40
+    numbers = {name: line for name, line in zip(lines, lines[1:], strict=False) if "/" in name}
+    assert len(numbers) > 40
+    assert all(re.fullmatch(r" *\d+ +(\d+\.\d+ GB|-) +(\d+\.\d+|-) +\d+\.\d+ GiB", line) for line in numbers.values())
+    assert re.fullmatch(r" *\d+ +\d+\.\d+ GB +\d+\.\d+ +limit 2\.00 GiB", lines[lines.index("total") + 1])
+
+
+def test_the_version_is_that_of_the_package():
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.exit_code == 0
+    assert done.output == f"romandask {romandask.__version__}\n"
+
+
+def test_a_shell_completes_commands():
+    environment = {"_ROMANDASK_COMPLETE": "complete_bash", "COMP_WORDS": "romandask re", "COMP_CWORD": "1"}
+    done = CliRunner().invoke(app, [], prog_name="romandask", env=environment)
+    assert done.output.split() == ["report", "reference"]
+
+
+def test_one_survey_of_a_pipeline_can_be_planned_alone(tmp_path):
     for alone, other in (("rubin=null", "coadds/rubin"), ("roman=null", "coadds/roman")):
         done = command("plan", "tiny", alone, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
@@ -81,8 +111,8 @@ def test_ingest_accounts_for_every_row(shared, tmp_path):
     assert (tmp_path / "s" / "truth" / "galaxies" / "collection.properties").is_file()
 
 
-def test_the_papers_survey_is_planned_whole(tmp_path):
-    """29,153 SCA images, 1039 tiles and 15.3 square degrees in the paper; nothing is made."""
+def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path):
+    """The paper has 29,153 SCA images, 1039 tiles and 15.3 square degrees."""
     done = command("plan", "troxel2023", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = [line.replace("│", " ").split() for line in done.stdout.splitlines() if "/" in line]

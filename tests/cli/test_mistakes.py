@@ -1,4 +1,4 @@
-"""Everything that a user may get wrong: one line that names it, exit code 2, and nothing written."""
+"""Mistakes of users in settings, arguments and input files: one line that names the mistake, exit code 2, no files."""
 
 import gzip
 import os
@@ -21,7 +21,7 @@ RUN = ("run", "p.yaml", "--store", "s")
 
 
 def changed(**sections) -> bytes:
-    """Return the tiny pipeline as YAML, some of its settings changed; None takes one out."""
+    """Return the tiny pipeline as YAML with some sections changed; None removes a section."""
     content = {key: dict(value) if isinstance(value, dict) else value for key, value in TINY.items()}
     for name, value in sections.items():
         if value is None:
@@ -187,7 +187,7 @@ SEQUENCES = {
 
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capsys):
-    """Return what runs a command in a folder of odd files and expects one line that holds some words."""
+    """Return a function that runs a command in a folder of invalid files and expects one error line with some words."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "pipeline.yaml").write_text("name: x\n")
@@ -207,10 +207,10 @@ def refused(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["romandask", *arguments])
         with pytest.raises(SystemExit) as ended:
             main()
-        told = capsys.readouterr()
-        lines = [line for line in told.err.splitlines() if line.strip()]
-        assert ended.value.code == 2, told
-        assert len(lines) == 1, told.err
+        output = capsys.readouterr()
+        lines = [line for line in output.err.splitlines() if line.strip()]
+        assert ended.value.code == 2, output
+        assert len(lines) == 1, output.err
         assert lines[0].startswith("error: ")
         for word in words:
             assert word in lines[0]
@@ -220,18 +220,18 @@ def refused(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(("content", "words"), YAMLS.values(), ids=YAMLS)
-def test_pipelines(tmp_path, refused, content, words):
+def test_invalid_pipelines_are_refused(tmp_path, refused, content, words):
     (tmp_path / "p.yaml").write_bytes(content)
     refused(RUN, words)
 
 
 @pytest.mark.parametrize(("arguments", "words"), COMMANDS.values(), ids=COMMANDS)
-def test_arguments(refused, arguments, words):
+def test_invalid_arguments_are_refused(refused, arguments, words):
     refused(arguments, words)
 
 
 @pytest.mark.parametrize(("content", "words"), OPSIM.values(), ids=OPSIM)
-def test_visits_of_rubin(tmp_path, refused, content, words):
+def test_invalid_rubin_visits_are_refused(tmp_path, refused, content, words):
     if isinstance(content, bytes):
         (tmp_path / "o.db").write_bytes(content)
     elif content is not None:
@@ -240,7 +240,7 @@ def test_visits_of_rubin(tmp_path, refused, content, words):
 
 
 @pytest.mark.parametrize(("content", "words"), SEQUENCES.values(), ids=SEQUENCES)
-def test_visits_of_roman(tmp_path, refused, content, words):
+def test_invalid_roman_visits_are_refused(tmp_path, refused, content, words):
     if isinstance(content, bytes):
         (tmp_path / "o.fits").write_bytes(content)
     elif content is not None:
@@ -253,14 +253,14 @@ def test_visits_of_roman(tmp_path, refused, content, words):
     [["rum"], ["run", "tiny"], [*RUN, "--workers", "-1"], [*RUN, "--wrokers", "1"], ["ingest", "skycatalogs", "x"], []],
     ids=" ".join,
 )
-def test_usage(tmp_path, monkeypatch, capsys, arguments):
-    """What the command line itself refuses is told with its usage."""
+def test_unknown_commands_and_options_are_refused(tmp_path, monkeypatch, capsys, arguments):
+    """A wrong command or option is reported with the usage text."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["romandask", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2
-    told = capsys.readouterr()
-    assert "Usage:" in told.err + told.out
-    assert "Traceback" not in told.err
+    output = capsys.readouterr()
+    assert "Usage:" in output.err + output.out
+    assert "Traceback" not in output.err
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Clusters that something else starts: their settings files do what they say."""
+"""Settings files for clusters of SLURM, Kubernetes and dask-gateway, and for TLS."""
 
 import importlib.util
 import os
@@ -37,34 +37,36 @@ def content(name: str) -> dict:
 
 @contextmanager
 def settings(*names: str, **more):
-    """Dask with the settings of some files."""
+    """Set the dask configuration of some files."""
     with dask.config.set(dask.config.merge(dask.config.config, *map(content, names), more)):
         yield
 
 
-def tool(path: Path, text: str) -> None:
+def write_script(path: Path, text: str) -> None:
     path.write_text(f"#!/bin/bash\n{text}\n")
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
 
 
 @pytest.fixture
 def queue(tmp_path, monkeypatch):
-    """SLURM's two commands for a queue of this machine: a job is a process of its own."""
+    """Fake sbatch and scancel that run a job as a local process."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    tool(folder / "sbatch", 'cp "${@: -1}" job.sh; setsid bash job.sh > job.log 2>&1 & echo "Submitted batch job $!"')
-    tool(folder / "scancel", 'for job in "$@"; do kill -- "-$job"; done')
+    write_script(
+        folder / "sbatch", 'cp "${@: -1}" job.sh; setsid bash job.sh > job.log 2>&1 & echo "Submitted batch job $!"'
+    )
+    write_script(folder / "scancel", 'for job in "$@"; do kill -- "-$job"; done')
     monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
     monkeypatch.setenv("PYTHONWARNINGS", "default")
     monkeypatch.chdir(tmp_path)
 
 
-def test_jobs_of_a_queue_make_the_same_over_tls(queue, tmp_path):
-    """dask-jobqueue with slurm.yaml: the job that it writes is run, and joins with its certificates."""
+def test_a_slurm_job_connects_over_tls_and_makes_identical_units(queue, tmp_path):
+    """dask-jobqueue with slurm.yaml writes a job script, which is run and connects with its certificates."""
     pipeline = load_pipeline("tiny", list(MINI))
-    place = Store(tmp_path / "here")
-    place.prepare()
-    running.run(Survey(pipeline, place), InProcess(), Reporter(Console(quiet=True)), SOME)
+    reference = Store(tmp_path / "here")
+    reference.prepare()
+    running.run(Survey(pipeline, reference), InProcess(), Reporter(Console(quiet=True)), SOME)
     on_loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with (
         settings("workers", "slurm"),
@@ -93,18 +95,18 @@ def test_jobs_of_a_queue_make_the_same_over_tls(queue, tmp_path):
     assert len(output_hashes(tmp_path / "here")) >= 5
 
 
-def test_with_tls_nothing_unencrypted_is_spoken_or_accepted(tmp_path):
-    """tls.yaml, its names those of certificates that are there."""
+def test_a_cluster_with_tls_refuses_unencrypted_connections(tmp_path):
+    """tls.yaml with the paths of temporary certificates."""
     made = Security.temporary()
     for name, text in (("ca", made.tls_ca_file), ("host", made.tls_worker_cert), ("host-key", made.tls_worker_key)):
         (tmp_path / f"{name}.pem").write_text(text)
     tls = content("tls")["distributed"]["comm"]["tls"]
-    there = {
+    with_paths = {
         key: str(tmp_path / value) if isinstance(value, str) else {k: str(tmp_path / v) for k, v in value.items()}
         for key, value in tls.items()
     }
     with (
-        settings("workers", "tls", distributed={"comm": {"tls": there}}),
+        settings("workers", "tls", distributed={"comm": {"tls": with_paths}}),
         LocalCluster(
             1,
             threads_per_worker=1,
@@ -118,8 +120,8 @@ def test_with_tls_nothing_unencrypted_is_spoken_or_accepted(tmp_path):
     ):
         address = cluster.scheduler_address
         assert address.startswith("tls://")
-        with runner(1, 2.0, address) as found:
-            assert address in found.description
+        with runner(1, 2.0, address) as execution:
+            assert address in execution.description
         with (
             pytest.raises(UserError, match=r"no dask scheduler answers there \(encryption required"),
             runner(1, 2.0, address.replace("tls://", "tcp://")),
@@ -127,8 +129,8 @@ def test_with_tls_nothing_unencrypted_is_spoken_or_accepted(tmp_path):
             pass
 
 
-def test_the_operator_takes_the_cluster_of_kubernetes():
-    """Its own definition of what a DaskCluster is; and commands and mounts that fit each other."""
+def test_the_kubernetes_cluster_is_valid_for_the_dask_operator():
+    """kubernetes.yaml follows the schema of the dask operator, and its commands and mounts are consistent."""
     (folder,) = importlib.util.find_spec("dask_kubernetes").submodule_search_locations
     charts = Path(folder) / "operator/deployment/helm/dask-kubernetes-operator/crds"
     definition = yaml.safe_load((charts / "daskcluster.yaml").read_text())
@@ -156,16 +158,16 @@ def test_the_operator_takes_the_cluster_of_kubernetes():
 
 
 @pytest.mark.parametrize(("name", "module"), [("gateway", dask_gateway), ("slurm", dask_jobqueue)])
-def test_every_setting_is_one_that_the_package_knows(name, module):
+def test_every_setting_is_known_to_its_package(name, module):
     defaults = yaml.safe_load(next(Path(module.__file__).parent.glob("*.yaml")).read_text())
 
-    def unknown(mine: dict, theirs: dict, before: str = "") -> list[str]:
-        out = []
-        for key, value in mine.items():
-            if key not in theirs:
-                out.append(before + key)
-            elif isinstance(value, dict) and theirs[key]:
-                out += unknown(value, theirs[key], f"{before}{key}.")
-        return out
+    def unknown(settings: dict, known: dict, prefix: str = "") -> list[str]:
+        keys = []
+        for key, value in settings.items():
+            if key not in known:
+                keys.append(prefix + key)
+            elif isinstance(value, dict) and known[key]:
+                keys += unknown(value, known[key], f"{prefix}{key}.")
+        return keys
 
     assert not unknown(content(name), defaults)

@@ -1,4 +1,4 @@
-"""Running stages: each begins when what it reads is there, side by side, units of the first ones first."""
+"""Schedule of stages: when each starts, which run at the same time, and which units are submitted first."""
 
 import io
 import time
@@ -35,22 +35,25 @@ SCHEMA = pa.schema([("number", pa.int64())])
 
 
 @dataclass(frozen=True)
-class Waits:
-    """Makes a row of each unit, once a file is there."""
+class WaitingMaker:
+    """Makes one row per unit, after a file exists."""
 
-    wanted: Path | None = None
-    made: Path | None = None
-    bad: tuple[int, ...] = ()
+    wait_for: Path | None = None
+    """File to wait for."""
+    creates: Path | None = None
+    """File that is created with each unit."""
+    failing: tuple[int, ...] = ()
+    """Units that raise an error."""
 
     def __call__(self, index: int) -> pd.DataFrame:
         deadline = time.monotonic() + 60
-        while self.wanted is not None and not self.wanted.exists():
-            assert time.monotonic() < deadline, f"{self.wanted} was not made in a minute"
+        while self.wait_for is not None and not self.wait_for.exists():
+            assert time.monotonic() < deadline, f"{self.wait_for} was not made in a minute"
             time.sleep(0.02)
-        if index in self.bad:
+        if index in self.failing:
             raise ArithmeticError(f"unit {index} cannot be made")
-        if self.made is not None:
-            self.made.touch()
+        if self.creates is not None:
+            self.creates.touch()
         return pd.DataFrame({"number": np.array([index], np.int64)})
 
 
@@ -66,204 +69,211 @@ def stage_of(name, units, maker, inputs=(), seconds=0.0):
     return RunnableStage(name=name, product=lambda: product, reads=reads)
 
 
-def happened_in(stages_, folder, execution=None):
-    """Run some stages; return what happened, in order, as (event, stage, unit), and the summary."""
+def logged_events(stages, folder, execution=None):
+    """Run some stages; return the logged events, in order, as (event, stage, unit), and the summary."""
     store = Store(folder / "store")
     this = Run(store, execution or InProcess(), Reporter(Console(file=io.StringIO())), Log(store.log), False)
     with this.ends:
-        run_stages(stages_, this)
-    found = [(one["event"], one["stage"], one.get("unit")) for one in events(store.log, this.log.name)]
-    return found, this.summary
+        run_stages(stages, this)
+    logged = [(event["event"], event["stage"], event.get("unit")) for event in events(store.log, this.log.name)]
+    return logged, this.summary
 
 
-def test_a_stage_that_reads_nothing_of_another_is_made_beside_it(tmp_path):
-    """The one coadd ends only when a unit of the index, the last stage of all, has been made."""
+def test_independent_stages_run_at_the_same_time(tmp_path):
+    """The only coadd waits for a file that is created by a unit of the last stage."""
     flag = tmp_path / "flag"
-    found = [
-        stage_of("coadds/x", 1, Waits(wanted=flag), seconds=60.0),
-        stage_of("detections/x", 2, Waits(), (("coadds/x", "u0"),)),
-        stage_of("truth_index/x", 3, Waits(made=flag)),
+    stages = [
+        stage_of("coadds/x", 1, WaitingMaker(wait_for=flag), seconds=60.0),
+        stage_of("detections/x", 2, WaitingMaker(), (("coadds/x", "u0"),)),
+        stage_of("truth_index/x", 3, WaitingMaker(creates=flag)),
     ]
     with runner(2, 1.5) as execution:
-        happened, summary = happened_in(found, tmp_path, execution)
+        logged, summary = logged_events(stages, tmp_path, execution)
     assert summary.made == {"coadds/x": 1, "detections/x": 2, "truth_index/x": 3}
     assert not summary.failed
-    assert happened[:2] == [("stage", "coadds/x", None), ("stage", "truth_index/x", None)]
-    at = {event: k for k, event in enumerate(happened)}
-    assert at["stage", "detections/x", None] > at["unit", "coadds/x", "u0"], "what reads another waits for it"
+    assert logged[:2] == [("stage", "coadds/x", None), ("stage", "truth_index/x", None)]
+    position = {event: k for k, event in enumerate(logged)}
+    assert position["stage", "detections/x", None] > position["unit", "coadds/x", "u0"], "a reader starts later"
 
 
-def test_in_one_process_stages_go_in_order(tmp_path):
-    found = [
-        stage_of("coadds/x", 2, Waits()),
-        stage_of("detections/x", 2, Waits(), (("coadds/x", "u0"), ("coadds/x", "u1"))),
-        stage_of("truth_index/x", 1, Waits()),
+def test_in_one_process_stages_run_in_order(tmp_path):
+    stages = [
+        stage_of("coadds/x", 2, WaitingMaker()),
+        stage_of("detections/x", 2, WaitingMaker(), (("coadds/x", "u0"), ("coadds/x", "u1"))),
+        stage_of("truth_index/x", 1, WaitingMaker()),
     ]
-    happened, _ = happened_in(found, tmp_path)
-    units = [stage for event, stage, _ in happened if event == "unit"]
+    logged, _ = logged_events(stages, tmp_path)
+    units = [stage for event, stage, _ in logged if event == "unit"]
     assert units == ["coadds/x", "coadds/x", "detections/x", "detections/x", "truth_index/x"]
 
 
-def test_units_are_not_known_before_truth_and_pointings_are_there(tmp_path):
-    """Though it reads nothing, a stage is not even put together before them."""
-    asked, store = [], Store(tmp_path / "store")
+def test_a_product_is_built_after_the_stages_that_determine_its_units(tmp_path):
+    """The stage reads no units of them, and still waits."""
+    recorded, store = [], Store(tmp_path / "store")
 
-    def put_together():
-        asked.append([*store.recorded("truth/stars"), *store.recorded("pointings/x")])
-        return TableProduct(stage="exposures/x", units=(Unit("u0", 0),), make=Waits(), schema=SCHEMA)
+    def build():
+        recorded.append([*store.recorded("truth/stars"), *store.recorded("pointings/x")])
+        return TableProduct(stage="exposures/x", units=(Unit("u0", 0),), make=WaitingMaker(), schema=SCHEMA)
 
-    found = [
-        stage_of("truth/stars", 1, Waits()),
-        stage_of("pointings/x", 1, Waits()),
-        RunnableStage(name="exposures/x", product=put_together, known_after=frozenset({"truth/stars", "pointings/x"})),
+    stages = [
+        stage_of("truth/stars", 1, WaitingMaker()),
+        stage_of("pointings/x", 1, WaitingMaker()),
+        RunnableStage(name="exposures/x", product=build, known_after=frozenset({"truth/stars", "pointings/x"})),
     ]
-    happened_in(found, tmp_path)
-    assert asked
-    assert all(names == ["u0", "u0"] for names in asked), asked
+    logged_events(stages, tmp_path)
+    assert recorded
+    assert all(names == ["u0", "u0"] for names in recorded), recorded
 
 
-def test_what_fails_holds_up_only_what_needs_it(tmp_path):
-    found = [
-        stage_of("coadds/x", 2, Waits(bad=(1,))),
-        stage_of("detections/x", 1, Waits(), (("coadds/x", "u1"),)),
-        stage_of("shear/x", 1, Waits(), (("coadds/x", "u0"),)),
+def test_a_failed_unit_blocks_only_the_units_that_need_it(tmp_path):
+    stages = [
+        stage_of("coadds/x", 2, WaitingMaker(failing=(1,))),
+        stage_of("detections/x", 1, WaitingMaker(), (("coadds/x", "u1"),)),
+        stage_of("shear/x", 1, WaitingMaker(), (("coadds/x", "u0"),)),
     ]
-    _, summary = happened_in(found, tmp_path)
+    _, summary = logged_events(stages, tmp_path)
     assert summary.failed == ["coadds/x/u1", "detections/x/u0 (an input is missing)"]
     assert summary.made == {"coadds/x": 1, "detections/x": 0, "shear/x": 1}
 
 
-def test_stages_that_wait_for_one_another_are_no_quiet_end(tmp_path):
-    found = [stage_of("a/x", 1, Waits(), (("b/x", "u0"),)), stage_of("b/x", 1, Waits(), (("a/x", "u0"),))]
+def test_stages_that_wait_for_one_another_raise_an_error(tmp_path):
+    stages = [
+        stage_of("a/x", 1, WaitingMaker(), (("b/x", "u0"),)),
+        stage_of("b/x", 1, WaitingMaker(), (("a/x", "u0"),)),
+    ]
     with pytest.raises(RuntimeError, match="wait for one another: a/x, b/x"):
-        happened_in(found, tmp_path)
+        logged_events(stages, tmp_path)
 
 
-class Future(SimpleNamespace):
-    """What becomes of a task."""
+class FakeFuture(SimpleNamespace):
+    """Future of a task that has finished."""
 
     __hash__ = object.__hash__
 
 
-class Client:
-    """Takes tasks, and ends one when it is told to."""
+class FakeClient:
+    """Client that records the submitted tasks and runs none."""
 
     def __init__(self):
         self.sent = []
+        """(stage kind, preferred worker, future) of each task."""
 
     def submit(self, _function, *arguments, key, workers=(None,), **_):
-        future = Future(status="finished", result=lambda: None, release=lambda: None, key=key)
+        future = FakeFuture(status="finished", result=lambda: None, release=lambda: None, key=key)
         future.add_done_callback = lambda call: None
         if len(arguments) > 1:
             self.sent.append((key.split("-")[0], workers[0], future))
         return future
 
 
-def test_of_a_later_stage_nothing_is_handed_out_while_an_earlier_one_has_units_that_wait(tmp_path):
-    client, threads = Client(), {"one": 1, "two": 1}
+def test_units_of_a_later_stage_are_submitted_after_those_of_an_earlier_one(tmp_path):
+    client, threads = FakeClient(), {"one": 1, "two": 1}
 
-    def wave(name, units, seconds, rank):
+    def submission(name, units, seconds, rank):
         product = TableProduct(
             stage=name,
             units=tuple(Unit(f"u{k}", k) for k in range(units)),
-            make=Waits(),
+            make=WaitingMaker(),
             schema=SCHEMA,
             seconds_per_unit=seconds,
         )
         tasks = [Task(k, "inputs", 1.0) for k in range(units)]
         return Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
 
-    waves = [wave("coadds/x", 3, 60.0, 0), wave("truth_index/x", 100, 1.0, 1)]
-    submit_units(waves, threads)
-    assert [sent[:2] for sent in client.sent] == [("coadds", "one"), ("coadds", "two")], "long ones one a thread"
-    assert waves[0].settle(client.sent[0][2])[0].index == 0
-    submit_units(waves, threads)
-    assert client.sent[2][:2] == ("coadds", "one"), "to the one that is free"
+    submissions = [submission("coadds/x", 3, 60.0, 0), submission("truth_index/x", 100, 1.0, 1)]
+    submit_units(submissions, threads)
+    assert [sent[:2] for sent in client.sent] == [("coadds", "one"), ("coadds", "two")], "one long unit per thread"
+    assert submissions[0].settle(client.sent[0][2])[0].index == 0
+    submit_units(submissions, threads)
+    assert client.sent[2][:2] == ("coadds", "one"), "the free worker"
     assert [name for name, *_ in client.sent[3:]] == ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 2)
 
 
-def test_units_that_wait_for_others_of_their_stage_do_not_keep_those_of_a_later_one_from_free_workers(tmp_path):
-    """Twenty exposures of one detector, each after the one before it: the other worker has the index."""
-    client, threads = Client(), {"one": 1, "two": 1}
+def test_units_that_wait_for_prerequisites_leave_free_workers_to_a_later_stage(tmp_path):
+    """Each of twenty exposures of one detector needs the one before it: the other worker makes the truth index."""
+    client, threads = FakeClient(), {"one": 1, "two": 1}
     first, second = (
         TableProduct(
             stage=name,
             units=tuple(Unit(f"u{k}", k) for k in range(20)),
-            make=Waits(),
+            make=WaitingMaker(),
             schema=SCHEMA,
             seconds_per_unit=seconds,
         )
         for name, seconds in (("exposures/x", 60.0), ("truth_index/x", 1.0))
     )
     chain = [Task(k, "inputs", 20.0 - k, "", (k - 1,) if k else ()) for k in range(20)]
-    alone = [Task(k, "inputs", 1.0) for k in range(20)]
-    waves = [
+    independent = [Task(k, "inputs", 1.0) for k in range(20)]
+    submissions = [
         Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
-        for rank, (product, tasks) in enumerate([(first, chain), (second, alone)])
+        for rank, (product, tasks) in enumerate([(first, chain), (second, independent)])
     ]
-    submit_units(waves, threads)
+    submit_units(submissions, threads)
     sent = [name for name, *_ in client.sent]
     assert sent == ["exposures"] * (1 + IN_FLIGHT_PER_THREAD * 2) + ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 1)
 
 
-def test_nothing_goes_on_when_the_store_can_take_no_more(tmp_path, monkeypatch):
+def test_a_full_store_ends_the_run(tmp_path, monkeypatch):
     def full(error, store):
         raise UserError(f"{store.root}: no space left")
 
     monkeypatch.setattr("romandask.engine.run_stages.refuse_full", full)
-    found = [stage_of("coadds/x", 1, Waits(bad=(0,))), stage_of("truth_index/x", 40, Waits(wanted=tmp_path / "never"))]
+    stages = [
+        stage_of("coadds/x", 1, WaitingMaker(failing=(0,))),
+        stage_of("truth_index/x", 40, WaitingMaker(wait_for=tmp_path / "never")),
+    ]
     with runner(1, 1.5) as execution:
         with pytest.raises(UserError, match="no space left"):
-            happened_in(found, tmp_path, execution)
+            logged_events(stages, tmp_path, execution)
         deadline = time.monotonic() + 30
         while execution._client.futures and time.monotonic() < deadline:
             time.sleep(0.1)
-        assert not execution._client.futures, "what was handed out is taken back"
+        assert not execution._client.futures, "submitted tasks are cancelled"
         (tmp_path / "never").touch()
 
 
-def test_what_a_run_was_stopped_before_it_could_seal_is_written_again(tmp_path, monkeypatch):
-    """All units of a catalog were made anew, but its files are still those of the run before."""
+def test_catalog_metadata_without_checksums_is_written_again(tmp_path, monkeypatch):
+    """All units of a catalog were made again, but the run was interrupted before it wrote the metadata."""
     written = []
     monkeypatch.setattr(
         "romandask.engine.run_stages.write_catalog_files", lambda product, *_: written.append(product.stage)
     )
     monkeypatch.setattr("romandask.engine.run_stages.catalog_metadata_files", lambda *_: [])
-    (one,) = [replace(stage_of("objects/x", 1, Waits()), sky=("ra", "dec"))]
-    happened_in([one], tmp_path)
+    stage = replace(stage_of("objects/x", 1, WaitingMaker()), sky=("ra", "dec"))
+    logged_events([stage], tmp_path)
     assert written == ["objects/x"]
     store = Store(tmp_path / "store")
     (store.catalog("objects/x")).mkdir(parents=True, exist_ok=True)
     (store.catalog("objects/x") / "hats.properties").touch()
-    happened_in([one], tmp_path)
-    assert written == ["objects/x"], "nothing was made, nothing is written"
+    logged_events([stage], tmp_path)
+    assert written == ["objects/x"], "not written if no unit was made"
     remove_checksums(store, "objects/x")
-    happened_in([one], tmp_path)
+    logged_events([stage], tmp_path)
     assert written == ["objects/x"] * 2
 
 
-def test_what_units_read_is_there_when_they_are_made(tmp_path, monkeypatch):
-    """A stage that began too early would make what it reads by itself: slowly, and in memory that nobody planned."""
+def test_units_that_are_read_are_stored(tmp_path, monkeypatch):
+    """A stage that starts too early would compute the units it reads itself, slowly and with unplanned memory."""
     pipeline = load_pipeline("tiny", [*MINI, "roman.detector=sca"])
-    known = {one.name for one in stage_products(Survey(pipeline))}
+    stage_names = {product.name for product in stage_products(Survey(pipeline))}
 
-    def checked(kind, name):
-        method = getattr(kind, name)
+    def check_reads(product_class, name):
+        method = getattr(product_class, name)
 
         def call(product, index, *arguments, **others):
-            there = product.store is None or product.stage not in known or product.has(index)
-            assert there, f"{product.stage}/{product.names[index]} is read and is not there"
+            stored = product.store is None or product.stage not in stage_names or product.has(index)
+            assert stored, f"{product.stage}/{product.names[index]} is read and is not stored"
             return method(product, index, *arguments, **others)
 
-        monkeypatch.setattr(kind, name, call)
+        monkeypatch.setattr(product_class, name, call)
 
-    for kind, name in ((TableProduct, "load"), (TableProduct, "select"), (ImageProduct, "load")):
-        checked(kind, name)
+    for product_class, name in ((TableProduct, "load"), (TableProduct, "select"), (ImageProduct, "load")):
+        check_reads(product_class, name)
     survey = Survey(pipeline, Store(tmp_path / "store"))
     survey.store.prepare()
     summary = running.run(survey, InProcess(), Reporter(Console(file=io.StringIO())))
     assert not summary.failed
-    assert set(summary.made) == known
+    assert set(summary.made) == stage_names
 
 
 EVERY_OPTION = [
@@ -277,7 +287,7 @@ EVERY_OPTION = [
 
 @pytest.mark.parametrize("settings", EVERY_OPTION, ids=" ".join)
 def test_units_read_what_their_stage_declares(settings):
-    """The declarations decide when a stage begins: a unit that read anything else might be made before it is there."""
+    """The declarations determine when a stage starts: a unit must not read anything else."""
     survey = Survey(load_pipeline(settings[0], list(settings[1:])))
     for one in stage_products(survey):
         product = survey.product(one.name)
@@ -294,7 +304,7 @@ def test_units_of_source_catalogs_read_what_their_stage_declares(shared):
         assert read <= one.reads, one.name
 
 
-def test_the_order_of_the_stages_is_one_in_which_they_can_run():
+def test_every_stage_is_after_the_stages_that_it_reads():
     for settings in EVERY_OPTION:
         before = set()
         for one in stage_products(Survey(load_pipeline(settings[0], list(settings[1:])))):
@@ -303,10 +313,10 @@ def test_the_order_of_the_stages_is_one_in_which_they_can_run():
     assert len({stage.name for stage in STAGES}) == len(STAGES)
 
 
-def test_the_picture_of_the_stages_is_what_they_read():
+def test_the_stage_diagram_has_an_arrow_for_each_direct_read():
     arrows = _reduced(kinds_read(stage_products(Survey(load_pipeline("tiny")))))
     assert arrows["exposures"] == {"truth", "pointings"}
-    assert arrows["coadds"] == {"exposures"}, "what exposures read need not be drawn again"
+    assert arrows["coadds"] == {"exposures"}, "indirect reads are not drawn"
     assert arrows["differences"] == arrows["truth_match"] == {"detections"}
     assert arrows["truth_index"] == {"truth", "pointings"}
     assert arrows["statistics"] == {"matches", "chance"}

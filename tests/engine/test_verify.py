@@ -1,4 +1,4 @@
-"""Faults: every byte that is not as it was written is found, and the same command makes the same bytes again."""
+"""Verification and repair of a store: every changed byte is found, and a new run makes the same bytes again."""
 
 import errno
 import json
@@ -15,7 +15,7 @@ import yaml
 from conftest import MINI, command
 
 from romandask.cli.main import main
-from romandask.engine.verify import BESIDE
+from romandask.engine.verify import OTHER_FILES
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
 from romandask.run import verify_store
@@ -23,7 +23,8 @@ from romandask.storage.manifest import digest
 from romandask.storage.store import Store, refuse_full
 from romandask.survey import open_survey
 
-FLIPS = 60
+DAMAGED_FILES = 60
+"""Minimum number of files that are damaged, one at a time."""
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def store(tmp_path_factory) -> Path:
 
 
 def stored(store: Path) -> list[Path]:
-    """Return every file of a store but its report, which is made from the others, and the logs of its runs."""
+    """Return every file of a store except its report, its logs and its lock."""
     files = (path for path in sorted(store.rglob("*")) if path.is_file() and path.stat().st_size)
     return [path for path in files if path.relative_to(store).parts[0] not in ("report", "log", ".lock")]
 
@@ -56,50 +57,50 @@ def stage_of(store: Path, path: Path) -> str:
 
 
 def damaged(store: Path, stage: str) -> list[str]:
-    return [name for found in verify_store(open_survey(store), stage) for name, _ in found.damaged]
+    return [name for result in verify_store(open_survey(store), stage) for name, _ in result.damaged]
 
 
-def test_a_store_is_as_it_was_written(store):
+def test_an_undamaged_store_is_verified(store):
     done = command("verify", str(store))
     assert done.returncode == 0, done.stdout
     assert "units are as they were written" in done.stdout
-    every = {stage_of(store, path) for path in stored(store)}
-    known = {found.stage for found in verify_store(open_survey(store))}
-    assert every <= known | set(BESIDE)
-    assert {"exposures/roman", "coadds/rubin", "truth/galaxies_margin", "matches/groups"} <= every
+    stages = {stage_of(store, path) for path in stored(store)}
+    verified = {result.stage for result in verify_store(open_survey(store))}
+    assert stages <= verified | set(OTHER_FILES)
+    assert {"exposures/roman", "coadds/rubin", "truth/galaxies_margin", "matches/groups"} <= stages
 
 
-def test_every_flipped_bit_and_every_cut_is_found(store):
-    """Of files of every kind, one at a time, none of them twice the same way."""
+def test_every_flipped_bit_and_every_truncation_is_found(store):
+    """At least one file of each kind is damaged, one at a time, at a random position."""
     random, files = rng(1, "flips"), stored(store)
     kinds: dict[tuple, list[Path]] = {}
     for path in files:
         kinds.setdefault((stage_of(store, path), path.suffix, path.parent.name == "0"), []).append(path)
     chosen = [members[int(random.integers(len(members)))] for members in kinds.values()]
-    chosen += [files[int(k)] for k in random.integers(len(files), size=max(0, FLIPS - len(chosen)))]
+    chosen += [files[int(k)] for k in random.integers(len(files), size=max(0, DAMAGED_FILES - len(chosen)))]
     missed = []
     for number, path in enumerate(chosen):
         content = path.read_bytes()
-        place = int(random.integers(len(content)))
+        position = int(random.integers(len(content)))
         if number % 5 == 4:
-            path.write_bytes(content[:place])
+            path.write_bytes(content[:position])
         else:
             changed = bytearray(content)
-            changed[place] ^= 1 << int(random.integers(8))
+            changed[position] ^= 1 << int(random.integers(8))
             path.write_bytes(changed)
         if path.name == "pipeline.yaml":
             found = ["pipeline.yaml"] if digest(path.read_bytes()) != digest(content) else []
         else:
             found = damaged(store, stage_of(store, path))
         if not found:
-            missed.append((str(path.relative_to(store)), place, len(content)))
+            missed.append((str(path.relative_to(store)), position, len(content)))
         path.write_bytes(content)
     assert not missed
-    assert len(chosen) >= FLIPS
+    assert len(chosen) >= DAMAGED_FILES
 
 
-def test_what_is_missing_is_found_and_made_again_to_the_byte(store, tmp_path):
-    """A chunk, a partition, a record and the metadata of a catalog are gone; the same command brings them back."""
+def test_missing_files_are_found_and_made_again_with_the_same_bytes(store, tmp_path):
+    """A chunk, a partition and the metadata of a catalog are removed and a record is changed; a new run makes them."""
     copy = tmp_path / "s"
     shutil.copytree(store, copy)
     before = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
@@ -123,7 +124,7 @@ def test_what_is_missing_is_found_and_made_again_to_the_byte(store, tmp_path):
     assert command("verify", str(copy)).returncode == 0
     after = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
     assert set(after) == set(before)
-    # records tell when, and properties of catalogs too; the settings where the command was given
+    # records and catalog properties hold times, and the settings hold the working directory
     skipped = {"manifest", "versions.json", "pipeline.yaml"}
     for name, content in before.items():
         if name.parts[0] not in skipped and name.name != "hats.properties":
@@ -132,7 +133,7 @@ def test_what_is_missing_is_found_and_made_again_to_the_byte(store, tmp_path):
         assert json.loads(after[name])["output"] == json.loads(before[name])["output"]
 
 
-def test_a_store_that_cannot_be_written_is_refused_by_one_line(tmp_path):
+def test_a_store_that_cannot_be_written_is_refused_with_one_line(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     done = command("run", "tiny", "--store", "file/s", *MINI, cwd=tmp_path)
     assert done.returncode == 2
@@ -141,19 +142,19 @@ def test_a_store_that_cannot_be_written_is_refused_by_one_line(tmp_path):
     assert np.array([path.name for path in tmp_path.iterdir()]).tolist() == ["file"]
 
 
-def test_a_disk_that_is_full_ends_the_run_with_one_line_and_the_same_command_resumes(tmp_path, monkeypatch, capsys):
-    """No unit is blamed for it, and what was stored before stays."""
+def test_a_full_disk_ends_the_run_with_one_line_and_the_same_command_resumes(tmp_path, monkeypatch, capsys):
+    """No unit is recorded as failed, and the stored units stay."""
     pq.write_table(pa.table({"id": [1, 2], "ra": [53.0, 53.1], "dec": [-40.0, -40.1]}), tmp_path / "stars.parquet")
     columns = {"id": "id", "ra": "ra", "dec": "dec", "magnorm": 20, "sed": "=none.txt"}
     stars = {"path": "stars.parquet", "columns": columns}
     (tmp_path / "map.yaml").write_text(yaml.safe_dump({"stars": stars}))
     (tmp_path / "seds").mkdir()
-    place = os.replace
+    replace = os.replace
 
     def full(source, target):
         if "quarantine" in str(target) and str(target).endswith(".parquet"):
             raise OSError(errno.ENOSPC, "No space left on device", str(target))
-        place(source, target)
+        replace(source, target)
 
     arguments = ["romandask", "ingest", "table", str(tmp_path / "map.yaml"), "--store", str(tmp_path / "s")]
     monkeypatch.setattr(sys, "argv", arguments)
@@ -162,10 +163,10 @@ def test_a_disk_that_is_full_ends_the_run_with_one_line_and_the_same_command_res
         with pytest.raises(SystemExit) as ended:
             main()
     assert ended.value.code == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert len(told) == 1
-    assert "No space left on device" in told[0]
-    assert "the same command resumes" in told[0]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert len(lines) == 1
+    assert "No space left on device" in lines[0]
+    assert "the same command resumes" in lines[0]
     assert not list((tmp_path / "s" / "manifest").rglob("*.failed"))
     assert (tmp_path / "s" / "manifest" / "truth" / "ingested").is_dir()
     with pytest.raises(SystemExit) as ended:
@@ -174,7 +175,7 @@ def test_a_disk_that_is_full_ends_the_run_with_one_line_and_the_same_command_res
     assert "rows in 2 = rows out 0 + quarantined 2" in capsys.readouterr().out
 
 
-def test_an_error_of_the_disk_is_known_through_what_came_of_it(tmp_path):
+def test_a_disk_error_is_recognised_as_the_cause_of_another_error(tmp_path):
     refuse_full(None, Store(tmp_path))
     refuse_full(OSError(errno.ENOENT, "No such file"), Store(tmp_path))
     wrapped = RuntimeError("could not be written")

@@ -14,8 +14,10 @@ import pandas as pd
 import pytest
 
 from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.rubin.settings import RubinSettings
 from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
 from romandask.stages.exposures.exposures import exposures
@@ -114,7 +116,7 @@ class SmallSurvey:
     def __init__(self):
         settings = RomanSettings(bands=("H158",))
         self.roman = replace(Roman(settings, n_waves=3), shape=(300, 300))
-        base = Exposure(0, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)
+        base = Exposure(visit=0, detector=7, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
         # the detector of interest lies off the boresight: shift the boresights by half a detector
         self.exposures = [replace(base, visit=k, dec=-40.0 + k * 14 / 3600, mjd=61541.0 + k) for k in range(3)]
         corners = np.stack([footprint(self.roman.header(e), self.roman.shape) for e in self.exposures])

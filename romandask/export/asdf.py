@@ -63,7 +63,7 @@ def export_asdf(
     survey_name = _survey_with_data_models(survey)
     exposure_units, coadd_units = [], []
     if exposures:
-        exposure_units = stored_units(survey.product(f"exposures/{survey_name}"), exposures, "exposure")
+        exposure_units = stored_units(survey.output(f"exposures/{survey_name}").product, exposures, "exposure")
     if tiles:
         coadd_units = tile_units(survey, survey_name, tiles, bands)
     make_folder(folder)

@@ -81,4 +81,4 @@ def tile_units(survey: Survey, survey_name: str, tiles: Sequence[str], bands: Se
     if unknown:
         raise UserError(f"band {unknown[0]!r}: {survey_name} has {', '.join(known)}")
     names = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-    return stored_units(survey.product(f"coadds/{survey_name}"), names, "tile")
+    return stored_units(survey.output(f"coadds/{survey_name}").product, names, "tile")

@@ -1,7 +1,7 @@
-"""What every telescope offers to the stages: the protocols of an instrument, of its readout and of its settings.
+"""Interface between the stages and a telescope: the protocol `Instrument`, and the base class of its settings.
 
-A telescope is a folder beside this module and one line in `romandask.pipeline`. No other room knows its name: what
-differs between telescopes is asked of `Instrument`.
+Each telescope is a folder in this package and one field of `romandask.pipeline.Pipeline`. The stages do not know any
+telescope by name; they use the members of `Instrument`.
 """
 
 from __future__ import annotations
@@ -9,47 +9,55 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import galsim
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
+from romandask.instruments.readout import Light, Readout
 from romandask.kernels.detectors.simple_detector import Detector
-from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
 from romandask.model.settings import Section
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
-from romandask.storage.arrays import Variable
 from romandask.storage.paths import AnyPath
 
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentContext:
-    """What an instrument takes from the other sections of a pipeline."""
+    """Values from other sections of a pipeline that an instrument needs."""
 
     n_waves: int
-    """Wavelengths across a band at which PSFs are computed."""
+    """Number of wavelengths per band at which PSFs are computed."""
     seed: int
-    """Of the survey."""
+    """Seed of the survey."""
     data: AnyPath
-    """Folder that the paths of source files are relative to."""
+    """Folder to which the paths of source files are relative."""
+
+
+class PointingSettings(Section):
+    """Base class of the `pointings` section of an instrument."""
+
+    source: str
+    """Format of the file with the list of visits (obseq, opsim), or the name of the instrument's own plan."""
+    path: str | None = None
+    """File with the list of visits, relative to `data`."""
 
 
 class InstrumentSettings(Section, ABC):
-    """The block of an instrument in a pipeline."""
+    """Base class of the section of an instrument in a pipeline."""
 
     every_band: ClassVar[tuple[str, ...]]
-    """Bands that the instrument has."""
+    """Names of all bands of the instrument."""
     usual_reference_band: ClassVar[str]
-    """Its reference band, where a pipeline has it."""
-    bands: Any
-    pointings: Any
-    """Its section `pointings`, with `source` and `path`."""
+    """Reference band of the instrument when the pipeline includes this band."""
+    bands: tuple[str, ...]
+    """Bands to simulate."""
+    pointings: PointingSettings
+    """Source of the visits."""
 
     @abstractmethod
     def instrument(self, context: InstrumentContext) -> Instrument:
@@ -58,116 +66,60 @@ class InstrumentSettings(Section, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Publication:
-    """Published figures of a survey, beside which the report puts its own."""
+    """Published results of a survey, which the report compares with its own."""
 
     source: str
+    """Citation."""
     depths: Mapping[str, float] = field(default_factory=dict)
-    """5-sigma depth of point sources by band, AB mag."""
+    """5-sigma depth of point sources in each band, AB mag."""
     galaxies: float | None = None
-    """Detected galaxies a square degree."""
+    """Detected galaxies per square degree."""
     stars: float | None = None
-    """Detected stars a square degree."""
-
-
-class Light(Protocol):
-    """The light on one exposure, before the detector: what a readout turns into data."""
-
-    exposure: Exposure
-    background: np.ndarray
-    """(ny, nx) expected electrons that do not come from objects."""
-
-    @property
-    def scene(self) -> Scene:
-        """The objects, in pixels and electrons."""
-
-    @property
-    def stamp_sizes(self) -> np.ndarray:
-        """(n,) pixels along a side of the stamp of each object; 0 for one that is not drawn."""
-
-    def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
-        """Return the noiseless image (ny, nx), electrons, of the objects, or of those where `chosen` (n,) is true."""
-
-    def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
-        """Return the cell of a position and GalSim's PSFs there, one a node."""
-
-
-class Readout(Protocol):
-    """A detector: turns light into what an exposure stores."""
-
-    @property
-    def variables(self) -> tuple[Variable, ...]:
-        """The arrays of an exposure beside the noiseless image, `image` first."""
-
-    @property
-    def tables(self) -> dict[str, pa.Schema]:
-        """Tables that are stored with an exposure: what it leaves to later ones."""
-
-    @property
-    def seconds_per_pixel(self) -> float:
-        """Time of a core that sky, noise, detector and storage take, as measured on a laptop."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What the arrays depend on, beside the settings that all instruments share."""
-
-    def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
-        """Return the rows of a pointings table whose exposures leave charge in that of a row, in order of time."""
-
-    def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
-        """Return the (stage, unit) that an exposure reads, beside the truth."""
-
-    def leave(self, light: Light) -> pd.DataFrame:
-        """Return the table that an exposure leaves to later ones."""
-
-    def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
-        """Return the arrays of an exposure by name, the noiseless `truth` among them, and its tables.
-
-        Parameters
-        ----------
-        light : Light
-        left : sequence of (Exposure, DataFrame)
-            Earlier exposures and what they left.
-        """
+    """Detected stars per square degree."""
 
 
 class Instrument(Protocol):
-    """A telescope and its camera, as the stages see it."""
+    """A telescope and its camera.
 
-    name: str
-    """Of its block in a pipeline, and of its products."""
-    title: str
-    """For people: `Roman`."""
-    facility: tuple[str, str]
-    """Names of the telescope and of the camera, as archives write them."""
-    code: int
-    """Unique number among all instruments, 0 to 7: part of the keys of friends of friends."""
-    blend_role: Literal["sharp", "blended"] | None
-    """Part in the count of unrecognised blends: objects of the blended survey that are several of the sharp one."""
-    data_model_elements: Mapping[str, str]
-    """By band, the name of the optical element in the mission's own data models (roman_datamodels); empty where there
-    are none for this telescope."""
-    publication: Publication | None
-    """Published figures, for the report."""
-    coadd_scale: float
-    """Pixel scale of its coadds, arcsec."""
-    pixel_scale: float
-    """Native, arcsec."""
-    shape: tuple[int, int]
-    """Detector (ny, nx)."""
-    field_radius: float
-    """No detector reaches further from the boresight, degrees."""
-    knot_smoothing: float
-    """Sigma, arcsec, of the Gaussian that smooths knots of galaxies."""
-    detector: Detector
-    aperture: float
-    """Radius of aperture photometry, arcsec: it holds most of the light of a point source."""
-    detection: Literal["median", "peaks"]
-    """median: Source Extractor on the median of bands; peaks: those of their weighted mean, smoothed with its PSF."""
-    detection_bands: tuple[str, ...] | None
-    """Bands that enter it; None for all."""
+    Members are grouped by subject: names, bands, pointings and coordinates, PSF, background, detector, and coadds with
+    their detection. Pixel coordinates x, y are 0 at the centre of the first pixel. A node is one of the wavelengths of
+    a band at which the PSF is computed (`Bandpass.nodes`).
+    """
 
-    visit_seconds: float
-    """Exposure time of one visit where the weight of a coadd is not its exposure time."""
+    # names
+
+    @property
+    def name(self) -> str:
+        """Name of the instrument's section in a pipeline and of its products, for example `roman`."""
+
+    @property
+    def title(self) -> str:
+        """Name in reports, for example `Roman`."""
+
+    @property
+    def facility(self) -> tuple[str, str]:
+        """Names of the telescope and of the camera, as archives write them."""
+
+    @property
+    def code(self) -> int:
+        """Number from 0 to 7, unique among all instruments; part of the keys in friends-of-friends matching."""
+
+    @property
+    def blend_role(self) -> Literal["sharp", "blended"] | None:
+        """Role in the count of unrecognised blends, or None for none.
+
+        An unrecognised blend is one object of the blended survey that is several objects of the sharp survey.
+        """
+
+    @property
+    def data_model_elements(self) -> Mapping[str, str]:
+        """Optical element of each band in the mission's data models (roman_datamodels); empty if there are none."""
+
+    @property
+    def publication(self) -> Publication | None:
+        """Published results for comparison in the report."""
+
+    # bands
 
     @property
     def bands(self) -> tuple[str, ...]:
@@ -179,36 +131,177 @@ class Instrument(Protocol):
 
     @property
     def colour_band(self) -> str:
-        """Band of the colour between two surveys' counterparts of an object."""
+        """Band for the colour of an object between its counterparts in two surveys."""
 
     @property
     def picture_bands(self) -> tuple[str, ...]:
-        """Bands of this pipeline from red to blue, for colour pictures."""
+        """Bands of this pipeline for colour pictures, ordered from red to blue."""
+
+    def bandpass(self, band: str) -> Bandpass:
+        """Return a bandpass with its PSF nodes."""
+
+    # pointings and coordinates
+
+    @property
+    def detectors(self) -> tuple[int, ...]:
+        """Numbers of the detectors."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of a detector (ny, nx), pixels."""
+
+    @property
+    def pixel_scale(self) -> float:
+        """Native pixel scale, arcsec."""
+
+    @property
+    def field_radius(self) -> float:
+        """Upper limit of the distance of any pixel from the boresight, degrees."""
+
+    def plan(self, region: Region, seed: int) -> pd.DataFrame:
+        """Generate the visits that cover a region.
+
+        Parameters
+        ----------
+        region : Region
+            Region to cover.
+        seed : int
+            Seed of the survey.
+
+        Returns
+        -------
+        DataFrame
+            One row per visit, with the fields of `Exposure` except `detector`. `seeing`, `airmass` and
+            `sky_brightness` are NaN for a telescope in space. More columns are allowed.
+        """
+
+    def footprints(self, visits: pd.DataFrame) -> np.ndarray:
+        """Return the corners of all detectors of n visits.
+
+        The computation is vectorised over visits, because pointings are tested against the region by the hundred
+        thousand.
+
+        Parameters
+        ----------
+        visits : DataFrame
+            Columns ra, dec and pa, degrees.
+
+        Returns
+        -------
+        ndarray, shape (n, detectors, 4, 2), degrees
+            Right ascension and declination of the corners, in the order of `exposure.footprint`.
+        """
+
+    def refused(self, visits: pd.DataFrame) -> np.ndarray:
+        """Return a mask, shape (n,), of the visits at which the telescope must not point.
+
+        Parameters
+        ----------
+        visits : DataFrame
+            Columns ra and dec, degrees, and mjd.
+        """
+
+    def header(self, exposure: Exposure) -> dict:
+        """Return the FITS header of the exact WCS of an exposure; every stage takes its WCS from this header."""
+
+    # PSF
 
     @property
     def psf_settings(self) -> dict[str, object]:
-        """What PSFs depend on but the exposure: a part of the hash of what is drawn with them."""
+        """Settings on which PSFs depend; part of the input hash of images that are drawn with the PSFs."""
+
+    def psf(self, exposure: Exposure) -> PsfModel:
+        """Return the chromatic PSF of an exposure, as it varies over the detector."""
+
+    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
+        """Return the PSF at one position, pixels, exact there and faster to compute than `psf`.
+
+        The model does not vary over the detector and must not be used at other positions.
+        """
+
+    def psf_key(self, exposure: Exposure) -> tuple:
+        """Return a hashable key; exposures with equal keys have equal PSFs."""
+
+    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
+        """Return `PsfModel.edges` of the PSF of an exposure, if possible without computing the whole model."""
+
+    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
+        """Return the larger and more detailed PSFs of bright stars, in increasing order of brightness; may be empty."""
+
+    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
+        """Return the PSF at a position, pixels, as GalSim profiles, one per node.
+
+        Profiles are in arcsec, with axes along the pixel grid, and do not include the response of a pixel. They are an
+        independent implementation of `psf`: the tests draw with both and compare.
+        """
+
+    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray) -> PsfModel:
+        """Return the weighted mean PSF of exposures of one band, on native pixels, for tiles drawn directly.
+
+        Parameters
+        ----------
+        exposures : list of Exposure
+            Exposures of one band.
+        weights : ndarray, shape (n,)
+            Weight of each exposure; the sum need not be 1.
+
+        Raises
+        ------
+        NotImplementedError
+            If `coadd` is never "draw" for this instrument.
+        """
 
     @property
-    def coadd(self) -> Literal["drizzle", "warp", "draw"]:
-        """How tiles are made: drizzled or warped from exposures, or drawn directly from the cadence."""
+    def knot_smoothing(self) -> float:
+        """Sigma of the Gaussian that smooths each knot of a galaxy, arcsec; 0 for point-like knots."""
+
+    # background and noise
+
+    def background(self, exposure: Exposure, header: dict, rows: slice = ..., columns: slice = ...) -> np.ndarray:
+        """Return the expected electrons that do not come from objects: sky, thermal emission and dark current.
+
+        Parameters
+        ----------
+        exposure : Exposure
+            The exposure.
+        header : dict
+            Its FITS header, from `header`.
+        rows, columns : slice, optional
+            Part of the detector; by default the whole detector.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx), float32, electrons
+        """
+
+    def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
+        """Return the mean noise of an empty pixel, electrons rms, given the image of the background, electrons."""
+
+    def pixel_noise(self, exposure: Exposure) -> float:
+        """Return the mean noise of an empty pixel, electrons rms, if possible without an image of the background."""
+
+    # detector
+
+    @property
+    def detector(self) -> Detector:
+        """Saturation and read noise."""
 
     @property
     def calibrated(self) -> bool:
-        """True where exposures are made with the calibrations of their detectors."""
+        """True if exposures are simulated with calibrations of the detectors."""
 
     def calibrations(self, detectors: Sequence[int]) -> ImageProduct | None:
-        """Return the lazy calibrations of some detectors; None where the instrument has none."""
+        """Return the lazy calibrations of some detectors; None if the instrument is not calibrated."""
 
     def readout(self, seed: int, calibration: ImageProduct | None) -> Readout:
-        """Return the detector.
+        """Return the readout of the detectors.
 
         Parameters
         ----------
         seed : int
-            Of the survey.
+            Seed of the survey.
         calibration : ImageProduct or None
-            What `calibrations` returned, stored or not; None where the instrument is not calibrated.
+            Result of `calibrations`, stored or not; None if the instrument is not calibrated.
         """
 
     def effects(
@@ -218,56 +311,55 @@ class Instrument(Protocol):
         expected: np.ndarray,
         left: Sequence[tuple[Exposure, pd.DataFrame]],
     ) -> dict[str, np.ndarray]:
-        """Return what each effect of the detector does around the brightest object: images (n, n), electrons.
+        """Return images of the change that each detector effect makes around the brightest object of an exposure.
 
-        Empty where the detector has no effects that can be taken apart.
+        Parameters
+        ----------
+        readout : Readout
+            Result of `readout`.
+        light : Light
+            The light of the exposure.
+        expected : ndarray, shape (ny, nx), electrons
+            Noiseless image of the objects, `light.expected()`.
+        left : sequence of (Exposure, DataFrame)
+            Earlier exposures and their tables, as for `Readout`.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n, n), electrons
+            Images by name of the effect, in the order in which the effects act; empty if the effects of the detector
+            cannot be separated.
         """
 
-    def bandpass(self, band: str) -> Bandpass:
-        """Return a bandpass, with the wavelengths at which the PSF is known."""
-
-    def plan(self, region: Region, seed: int) -> pd.DataFrame:
-        """Return visits that cover a region: the columns of Exposure without the detector."""
+    # coadds and detection
 
     @property
-    def detectors(self) -> tuple[int, ...]:
-        """Numbers of the detectors."""
+    def coadd(self) -> Literal["drizzle", "warp", "draw"]:
+        """Method of coaddition: drizzle or warp exposures, or draw tiles directly from the cadence."""
 
-    def footprints(self, visits: pd.DataFrame) -> np.ndarray:
-        """Return the corners (n, detectors, 4, 2), degrees, of every detector of visits (columns ra, dec, pa)."""
+    @property
+    def coadd_scale(self) -> float:
+        """Pixel scale of coadds, arcsec."""
 
-    def refused(self, visits: pd.DataFrame) -> np.ndarray:
-        """True where the telescope cannot point there and then (columns ra, dec, mjd)."""
+    @property
+    def visit_seconds(self) -> float:
+        """Exposure time of one visit, seconds.
 
-    def header(self, exposure: Exposure) -> dict:
-        """Return the exact FITS header of an exposure."""
+        Converts flux to electrons on coadds whose weight is not an exposure time (`coadd` "warp" and "draw").
+        """
 
-    def psf(self, exposure: Exposure) -> PsfModel:
-        """Return the chromatic PSF of an exposure."""
+    @property
+    def aperture(self) -> float:
+        """Radius of aperture photometry, arcsec; the aperture contains most of the light of a point source."""
 
-    def psf_at(self, exposure: Exposure, x: float, y: float) -> PsfModel:
-        """Return the PSF at one place, exactly: of no use elsewhere, and sooner made than the whole."""
+    @property
+    def detection(self) -> Literal["median", "peaks"]:
+        """Method of detection.
 
-    def psf_key(self, exposure: Exposure) -> tuple:
-        """Return what tells the PSFs of exposures apart: where it is the same they are."""
+        - median: Source Extractor on the median of the detection bands.
+        - peaks: peaks of the weighted mean of the detection bands, smoothed with its PSF.
+        """
 
-    def psf_edges(self, exposure: Exposure) -> dict[int, float]:
-        """Return `edges` of that PSF, without the work of the whole."""
-
-    def bright_psfs(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
-        """Return the PSFs of its bright stars, the brightest last."""
-
-    def profiles(self, exposure: Exposure, x: float, y: float) -> list[galsim.GSObject]:
-        """Return GalSim's PSFs (arcsec, in the frame of the pixels, without their response), one a node, at a place."""
-
-    def background(self, exposure: Exposure, header: dict, rows: slice = ..., columns: slice = ...) -> np.ndarray:
-        """Return the expected electrons (ny, nx) that do not come from objects, of all or some pixels."""
-
-    def sky_noise(self, exposure: Exposure, background: np.ndarray) -> float:
-        """Return the noise of an empty pixel, electrons rms."""
-
-    def pixel_noise(self, exposure: Exposure) -> float:
-        """Return the noise of an empty pixel, electrons rms, without making the image of the background."""
-
-    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray) -> PsfModel:
-        """Return the weighted mean PSF of some exposures of one band, for tiles that are drawn from the cadence."""
+    @property
+    def detection_bands(self) -> tuple[str, ...] | None:
+        """Bands that are combined for detection; None for all bands."""

@@ -1,4 +1,4 @@
-"""The readout of the simple detector: sky, Poisson noise, saturation, read noise, whole electrons."""
+"""Readout of the simple detector: sky, Poisson noise, saturation, read noise, rounding to whole electrons."""
 
 from __future__ import annotations
 
@@ -11,36 +11,38 @@ import pandas as pd
 import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.instrument import Light
+from romandask.instruments.readout import Light
 from romandask.kernels.detectors.simple_detector import DQ_FLAGS, Detector, observe
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SimpleReadout:
-    """Reads out exposures with the simple detector."""
+    """Readout with the simple detector; implements `Readout`."""
 
     name: str
-    """Of the instrument."""
+    """Name of the instrument."""
     detector: Detector
+    """Saturation and read noise."""
     shape: tuple[int, int]
-    """(ny, nx) pixels."""
+    """Shape of the detector (ny, nx), pixels."""
     seed: int
+    """Seed of the survey."""
     seconds_per_pixel: float = 2.5e-7
 
     @property
     def variables(self) -> tuple[Variable, ...]:
         """The observed image and its data quality."""
-        masks = {
+        quality = {
             "long_name": "data quality",
             "flag_masks": list(DQ_FLAGS.values()),
             "flag_meanings": " ".join(DQ_FLAGS),
         }
-        text = {"units": "electron", "long_name": "observed image"}
+        electrons = {"units": "electron", "long_name": "observed image"}
         return (
-            Variable("image", "int32", self.shape, ("y", "x"), text),
-            Variable("dq", "uint8", self.shape, ("y", "x"), masks),
+            Variable("image", "int32", self.shape, ("y", "x"), electrons),
+            Variable("dq", "uint8", self.shape, ("y", "x"), quality),
         )
 
     @property
@@ -50,11 +52,11 @@ class SimpleReadout:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Nothing beside what all instruments share."""
+        """No settings in addition to those of all instruments."""
         return {}
 
     def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
-        """Return no rows: the detector keeps nothing from one exposure to the next."""
+        """Return no rows: the simple detector has no persistence."""
         return np.empty(0, int)
 
     def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
@@ -62,11 +64,11 @@ class SimpleReadout:
         return ()
 
     def leave(self, light: Light) -> pd.DataFrame:
-        """Raise NotImplementedError: nothing is left."""
+        """Raise NotImplementedError: the simple detector has no persistence."""
         raise NotImplementedError("the simple detector leaves nothing to later exposures")
 
     def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
-        """Return image, truth and dq of an exposure."""
+        """Return image, truth and dq of an exposure; `left` is not used."""
         exposure, expected = light.exposure, light.expected()
         random = rng(self.seed, "exposures", self.name, exposure.visit, exposure.detector)
         image, dq = observe(expected, light.background, self.detector, random)

@@ -9,6 +9,7 @@ import astropy.units as u
 import cdshealpix.nested as healpix
 import numpy as np
 from astropy.coordinates import Latitude, Longitude
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from romandask.model.errors import UserError
@@ -23,13 +24,13 @@ _FOOTPRINTS_PER_BATCH = 20_000
 """Number of footprints that positions are compared with at a time."""
 
 
-def unit_vectors(ra, dec) -> np.ndarray:
+def unit_vectors(ra: ArrayLike, dec: ArrayLike) -> np.ndarray:
     """Return unit vectors (..., 3) of positions in degrees."""
     ra, dec = np.radians(ra), np.radians(dec)
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 
-def radec(vectors) -> tuple[np.ndarray, np.ndarray]:
+def radec(vectors: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return right ascension in [0, 360) and declination, degrees, of vectors (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(vectors), -1, 0)
     return np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -40,7 +41,7 @@ def chord(angle: float) -> float:
     return 2 * np.sin(angle * ARCSEC / 2)
 
 
-def from_tangent_plane(ra: float, dec: float, xi, eta) -> tuple[np.ndarray, np.ndarray]:
+def from_tangent_plane(ra: float, dec: float, xi: ArrayLike, eta: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Deproject gnomonic offsets to the sky.
 
     Parameters
@@ -100,7 +101,9 @@ def touching_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     return i[order], j[order]
 
 
-def covering_sums(footprints: np.ndarray, ra, dec, weights: np.ndarray | None = None) -> np.ndarray:
+def covering_sums(
+    footprints: np.ndarray, ra: ArrayLike, dec: ArrayLike, weights: np.ndarray | None = None
+) -> np.ndarray:
     """Return the summed weight, or the number, of the footprints that cover each position.
 
     Parameters
@@ -278,7 +281,7 @@ class Cone:
     radius: float
     """Angular radius, arcsec."""
 
-    def contains(self, ra, dec) -> np.ndarray:
+    def contains(self, ra: ArrayLike, dec: ArrayLike) -> np.ndarray:
         """Return True for positions (degrees) inside the cone or on its edge."""
         gap = np.linalg.norm(unit_vectors(ra, dec) - unit_vectors(self.ra, self.dec), axis=-1)
         return gap <= chord(self.radius)
@@ -306,7 +309,9 @@ def cell_area(order: int) -> float:
     return 4 * np.pi * (180 * 60 / np.pi) ** 2 / (12 * 4**order)
 
 
-def offset_positions(ra, dec, separation, position_angle) -> tuple[np.ndarray, np.ndarray]:
+def offset_positions(
+    ra: ArrayLike, dec: ArrayLike, separation: ArrayLike, position_angle: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Return positions at a separation and position angle from given positions.
 
     Parameters

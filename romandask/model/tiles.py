@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, from_tangent_plane
@@ -96,7 +97,7 @@ class TileGrid:
         """Return the side of the padded image, in pixels of `scale` arcsec."""
         return int(np.ceil(self.side / scale - 1e-6))
 
-    def owner(self, ra, dec) -> np.ndarray:
+    def owner(self, ra: ArrayLike, dec: ArrayLike) -> np.ndarray:
         """Return the id of the tile whose inner area contains each position (degrees)."""
         step = self.inner / 3600
         ring = np.clip(np.floor((np.asarray(dec, float) + 90) / step), 0, self._rings - 1).astype(np.int64)

@@ -17,8 +17,9 @@ import numpy as np
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.calibration import calibrations
 from romandask.instruments.roman.calibration_source import CalibrationSource
-from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.roman import Roman
 from romandask.instruments.roman.sca_readout import ScaReadout, trapped_table
+from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.detectors import sca
 from romandask.kernels.detectors.brighter_fatter import brighter_fatter
 from romandask.kernels.detectors.sca_exposure import Planes, accumulate, calibrate, read_out
@@ -58,9 +59,9 @@ def run(folder: Path) -> None:
     product.write(0, store)
     print(f"calibrations made {time.perf_counter() - start:6.2f} s  once an SCA")
     write_record(store, Record(product.stage, product.names[0], "", "", 0, 0, 0.0, 0))
-    roman = Roman(RomanSettings(detector="sca"), 5, source)
-    readout = ScaReadout(roman, product.stored(store), SEED, cosmic_rays=False)
-    exposure = Exposure(1, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 0.0)
+    roman = Roman(RomanSettings(detector="sca"), n_waves=5, calibration=source)
+    readout = ScaReadout(instrument=roman, calibration=product.stored(store), seed=SEED, cosmic_rays=False)
+    exposure = Exposure(visit=1, detector=7, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=0.0)
     planes = readout.planes(exposure)
     response = readout.response(exposure, planes)
     light = np.full((4088, 4088), 185.0, np.float32)

@@ -18,7 +18,8 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.model.tiles import tangent_header
@@ -66,7 +67,8 @@ def package(
 
 def main() -> None:
     """Run the benchmark."""
-    source = WCS(Roman(RomanSettings(), 5).header(Exposure(1, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 30.0)))
+    exposure = Exposure(visit=1, detector=7, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=30.0)
+    source = WCS(Roman(RomanSettings()).header(exposure))
     ra, dec = source.all_pix2world(2043.5, 2043.5, 0)
     target = WCS(tangent_header(float(ra), float(dec), PIXELS, SCALE))
     random = np.random.default_rng(1)

@@ -10,7 +10,8 @@ import time
 import galsim.roman
 import numpy as np
 
-from romandask.instruments.roman.optics import FOLDS, MIDDLE, optics, pupil, transforms
+from romandask.instruments.roman.bands import BANDS
+from romandask.instruments.roman.optics import MIDDLE, optics, pupil, transforms
 from romandask.kernels.rendering.galsim_sampling import sample
 from romandask.kernels.rendering.psf import Grid, place_grid, star_image
 from romandask.kernels.universe.bandpasses import roman_bandpass
@@ -24,7 +25,7 @@ def main() -> None:
     """Time both, a wavelength after another, each at all its places."""
     print(f"{'':24s}{'GalSim':>10s}{'here':>10s}{'ratio':>8s}{'of peak':>10s}")
     for sca, band, pupil_bin, size in CASES:
-        grid = Grid(size, FOLDS[band] if pupil_bin > 2 else 2)
+        grid = Grid(size, BANDS[band].frequency_folds if pupil_bin > 2 else 2)
         wave = float(roman_bandpass(band, 5).nodes[2])
         places = [tuple(place) for place in place_grid(SIDE, 2)] if size == 128 else [MIDDLE]
         pupil(sca, band, pupil_bin)

@@ -18,7 +18,8 @@ import numpy as np
 import pandas as pd
 
 from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.fourier import POINT
 from romandask.kernels.rendering.galsim_engine import object_profile
@@ -36,7 +37,7 @@ RNG = 20230992
 
 def full_density(roman: Roman) -> RenderExposure:
     """Return an exposure of one SCA over the generator's own catalogs."""
-    exposure = Exposure(1, 7, BAND, 61541.0, 139.8, 53.0, -40.0, 120.0)
+    exposure = Exposure(visit=1, detector=7, band=BAND, mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
     corners = footprint(roman.header(exposure), roman.shape)
     row = vars(exposure) | dict(zip(CORNERS, corners.ravel(), strict=True))
     region = Region(corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max())

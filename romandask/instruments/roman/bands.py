@@ -1,4 +1,4 @@
-"""Roman's bands: all that differs from band to band and is not in GalSim. A new band is one entry here."""
+"""Roman's bands: constants of each filter that are not in GalSim. A new band is one entry of `BANDS`."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class RomanBand:
-    """One filter of the Wide Field Instrument, by the name that GalSim has for it."""
+    """One filter of the Wide Field Instrument."""
 
     name: str
+    """Name of the filter in GalSim."""
     optical_element: str
-    """Name of the filter in the mission's data models."""
+    """Name of the filter in the mission's data models (roman_datamodels)."""
     frequency_folds: int
-    """Multiples of the pixels' Nyquist frequency that the optics reach."""
+    """Highest frequency that the optics transmit, as a whole multiple of the Nyquist frequency of the pixels."""
     dithers: tuple[int, ...]
-    """Exposures of every field in each pass (Troxel et al. 2023, section 3)."""
+    """Number of exposures of every field in each pass (Troxel et al. 2023, section 3)."""
     roll: float
-    """Difference from the best roll, degrees: tiles of different bands are turned against each other."""
+    """Offset from the best roll, degrees, so that the fields of different bands are rotated against each other."""
     low_zodiacal: bool
-    """True where dates of low zodiacal light are chosen; the other bands take the remaining time."""
+    """True if the band is observed on dates of low zodiacal light; the other bands use the remaining dates."""
     depth: float | None = None
-    """5-sigma depth of point sources, AB mag (Troxel et al. 2023)."""
+    """Published 5-sigma depth of point sources, AB mag (Troxel et al. 2023)."""
 
 
 BANDS: dict[str, RomanBand] = {
@@ -65,8 +66,8 @@ BANDS: dict[str, RomanBand] = {
         ),
     )
 }
-"""In order of wavelength."""
+"""Bands by name, in order of wavelength."""
 REFERENCE_BAND = "H158"
 """Band in which objects are counted and compared with the truth."""
 COLOUR_BAND = "F184"
-"""Band of the colour between Rubin's and Roman's counterparts of an object."""
+"""Band for the colour of an object between its counterparts in Rubin and Roman."""

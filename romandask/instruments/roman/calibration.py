@@ -1,4 +1,4 @@
-"""Calibrations of Roman's detectors: files made from a seed or checked, and the stage from which workers read rows."""
+"""Calibrations of Roman's detectors: making and checking of files, and the product from which workers read rows."""
 
 from __future__ import annotations
 
@@ -20,16 +20,27 @@ from romandask.products.units import Unit
 from romandask.storage.arrays import Variable
 
 BYTES = 1_600_000_000
-"""Of one file."""
+"""Size of one calibration file, bytes."""
 
 
 def make_files(folder: Path, seed: int, scas: Sequence[int] = SCAS) -> Iterator[Path]:
-    """Write calibration files of made-up SCAs and yield where each is; the same from the same seed, in any order.
+    """Write calibration files of synthetic SCAs, one at a time, and yield their paths.
+
+    The file of an SCA depends only on the seed and the SCA.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the files; made if it does not exist.
+    seed : int
+        Seed of the synthetic calibrations.
+    scas : sequence of int
+        Numbers of the SCAs, 1 to 18.
 
     Raises
     ------
     UserError
-        If there is no such SCA, or the folder cannot be written or has no room.
+        If an SCA does not exist, or the folder cannot be written or has too little free space.
     """
     for sca in scas:
         if sca not in SCAS:
@@ -51,29 +62,30 @@ def make_files(folder: Path, seed: int, scas: Sequence[int] = SCAS) -> Iterator[
 
 
 def check_files(folder: Path) -> list[Path]:
-    """Return the calibration files of a folder, each as it should be.
+    """Return the paths of the calibration files in a folder, after a check of their layout.
 
     Raises
     ------
     UserError
-        If there are none, or one is not laid out as it should be.
+        If there is no calibration file, or a file has another layout than that of `calibration_files`.
     """
-    found = [path for sca in SCAS if (path := path_of(folder, sca)).is_file()]
-    if not found:
+    paths = [path for sca in SCAS if (path := path_of(folder, sca)).is_file()]
+    if not paths:
         raise UserError(f"{folder}: no calibration file ({path_of(folder, 1).name} to {path_of(folder, 18).name})")
-    for path in found:
+    for path in paths:
         check(path)
-    return found
+    return paths
 
 
 _YX, _GRID = ("y", "x"), (4096, 4096)
 
 
 def _variable(name: str, dtype: str, shape: tuple[int, ...], axes: tuple[str, ...], unit: str, text: str) -> Variable:
-    # noise from pixel to pixel, which compresses by a tenth, and is read a block of rows at a time by every exposure
+    # not compressed: pixel-to-pixel noise compresses by a tenth only, and every exposure reads it in blocks of rows
     return Variable(name, dtype, shape, axes, {"units": unit, "long_name": text}, compress=False)
 
 
+# axes over blocks of 64, 128 and 8 pixels a side
 _OF_64, _OF_128, _OF_8 = (("by", "bx"), ("cy", "cx"), ("ay", "ax"))
 VARIABLES = (
     _variable("RELQE1", "float32", _GRID, _YX, "1", "relative quantum efficiency of pixels"),
@@ -91,24 +103,34 @@ VARIABLES = (
     _variable("GAIN", "float32", (32, 32), _OF_128, "electron/DN", "gain, 128-pixel blocks"),
     _variable("BIAS", "uint16", _GRID, _YX, "DN", "bias"),
 )
-"""What exposures need of table 1, in fewer bytes, for all workers read it: of READ the last plane, of BADPIX the bits
-that are known; float16 (11 bits) where what it describes is itself known, or acts, no better than to a per cent."""
+"""Calibrations of table 1 that exposures use, with small dtypes because all workers read them.
+
+READ has only its last plane, BADPIX only the bits with a meaning. float16 (11 bits of precision) is used for quantities
+that are known, or matter, to no better than one per cent.
+"""
 
 
 def unit_name(sca: int) -> str:
-    """Return the name of the unit of an SCA."""
+    """Return the name of the unit of an SCA, for example sca07."""
     return f"sca{sca:02d}"
 
 
 def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct:
-    """Return the lazy calibrations of some SCAs: dims (sca, ...), one variable an extension of the paper's table 1.
+    """Return the lazy calibrations of some SCAs: dimensions (sca, ...), one variable for each of `VARIABLES`.
 
-    Stored, it is what all workers read: uncompressed, with checksums, a few rows at a time.
+    All workers read the stored product a few rows at a time; it is uncompressed and has checksums.
+
+    Parameters
+    ----------
+    source : CalibrationSource
+        Files, or seed of synthetic calibrations.
+    scas : sequence of int
+        Numbers of the SCAs.
 
     Raises
     ------
     UserError
-        If a file is missing, or not laid out as it should be.
+        If a file is missing or has another layout than that of `calibration_files`.
     """
     source.check(scas)
     units = tuple(Unit(unit_name(sca), {"sca": sca, "source": source.state(sca)}) for sca in scas)
@@ -129,7 +151,7 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
         axes=("sca",),
         lengths=(len(scas),),
         coordinates=coordinates,
-        # the largest plane as it is made or read, and as it is stored
+        # the largest plane, in the dtype of the file and in that of the store
         bytes_per_unit=1300 << 20,
         seconds_per_unit=15.0,
         stream=maker.stream,
@@ -138,22 +160,26 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
 
 @dataclass(frozen=True)
 class MakeCalibration:
-    """Reads, or makes up, the calibrations of one SCA."""
+    """Makes the units of the calibrations: reads a file, or draws synthetic calibrations."""
 
     source: CalibrationSource
+    """Files, or seed of synthetic calibrations."""
     scas: tuple[int, ...]
+    """Number of the SCA of each unit."""
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
-        """Return the planes of an SCA by name."""
+        """Return the arrays of a unit by name."""
         return dict(self.stream(index))
 
     def stream(self, index: int) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield the planes of an SCA, one after another."""
-        kinds = {variable.name: variable.dtype for variable in VARIABLES}
+        """Yield name and values of the arrays of a unit, one at a time."""
+        dtypes = {variable.name: variable.dtype for variable in VARIABLES}
         for name, values in self.source.planes(self.scas[index]):
-            if name in kinds:
+            if name in dtypes:
+                # the read noise of an exposure; planes 0 and 1 are the reset noise and its scatter
                 values = values[2] if name == "READ" else values
-                # of bits that nobody asks for none is kept, and float16 ends at 65504
+                # the bits that fit into uint8
                 values = values & 255 if name == "BADPIX" else values
-                values = np.minimum(values, 65504) if kinds[name] == "float16" else values
-                yield name, values.astype(kinds[name], copy=False)
+                # the largest float16
+                values = np.minimum(values, 65504) if dtypes[name] == "float16" else values
+                yield name, values.astype(dtypes[name], copy=False)

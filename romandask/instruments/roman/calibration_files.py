@@ -1,4 +1,4 @@
-"""Calibration files of Roman's detectors: one FITS file an SCA, laid out as in table 1 of Troxel et al. (2023)."""
+"""Calibration files of Roman's detectors: one FITS file per SCA, with the layout of Troxel et al. (2023), table 1."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from romandask.storage.paths import AnyPath, local_copy
 
 @dataclass(frozen=True)
 class Extension:
-    """What table 1 says of an extension."""
+    """Layout of an extension of the file."""
 
     name: str
+    """Name of the extension."""
     dtype: str
-    """Of its values, as NumPy names it; empty for the table and for what holds none."""
+    """NumPy dtype of the values; empty for the table SOURCES and for extensions without values."""
     shape: tuple[int, ...]
-    """In NumPy's order."""
+    """Shape of the values, in the order of NumPy."""
     text: str
+    """Description."""
 
 
-_SIDE = 4096
-_WHOLE = (_SIDE, _SIDE)
+_WHOLE = (4096, 4096)
 TABLE = (
     Extension("SOURCES", "", (), "where each extension is from"),
     Extension("RELQE1", "f4", _WHOLE, "relative quantum efficiency of pixels"),
@@ -51,41 +52,54 @@ TABLE = (
     Extension("GAIN", "f4", (32, 32), "gain, e/DN"),
     Extension("BIAS", "u2", _WHOLE, "bias, DN"),
 )
-"""The extensions in their order."""
+"""The extensions of table 1, in order."""
 BY_NAME = {extension.name: extension for extension in TABLE}
+"""The extensions by name."""
 FLAT = {"BFEFLAT": "BFE", "IPCFLAT": "IPC"}
+"""Extensions that hold the kernels of another extension side by side, and the name of the other extension."""
 _BITPIX = {"f4": (-32, 0), "f8": (-64, 0), "i4": (32, 0), "u4": (32, 1 << 31), "u2": (16, 1 << 15)}
-"""BITPIX and BZERO of each dtype."""
+"""BITPIX and BZERO in FITS, by dtype."""
 
 
 def path_of(folder: AnyPath, sca: int) -> AnyPath:
-    """Return the file of an SCA in a folder."""
+    """Return the path of the file of an SCA in a folder."""
     return folder / f"sca{sca:02d}.fits"
 
 
 def flat(kernels: np.ndarray) -> np.ndarray:
-    """Return kernels (n, n, blocks y, blocks x) with the blocks side by side, (n blocks y, n blocks x)."""
+    """Return kernels of shape (n, n, by, bx) side by side as an image of shape (n * by, n * bx)."""
     n, _, by, bx = kernels.shape
     return np.ascontiguousarray(kernels.transpose(2, 0, 3, 1)).reshape(n * by, n * bx)
 
 
 def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source: str) -> None:
-    """Write a calibration file, one extension after another, so that one is in memory at a time.
+    """Write a calibration file, with one extension in memory at a time.
 
     Parameters
     ----------
-    planes : names and values of the extensions that hold numbers, in the order of TABLE; BFEFLAT and IPCFLAT follow
-        from BFE and IPC
-    source : what SOURCES says of each
+    path : Path
+        Path of the file; it is replaced once the new file is complete.
+    sca : int
+        Number of the SCA.
+    planes : iterable of (str, ndarray)
+        Names and values of the extensions with values, in the order of TABLE, without BFEFLAT and IPCFLAT, which follow
+        from BFE and IPC.
+    source : str
+        Source of every extension, for the table SOURCES.
+
+    Raises
+    ------
+    ValueError
+        If a name, dtype or shape differs from TABLE.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-    named = [extension.name for extension in TABLE if extension.dtype]
+    names = [extension.name for extension in TABLE if extension.dtype]
     columns = [
-        fits.Column("EXTNAME", "16A", array=np.array(named)),
-        fits.Column("SOURCE", "80A", array=np.array([source] * len(named))),
+        fits.Column("EXTNAME", "16A", array=np.array(names)),
+        fits.Column("SOURCE", "80A", array=np.array([source] * len(names))),
     ]
-    given = iter(planes)
-    last: dict[str, np.ndarray] = {}
+    remaining = iter(planes)
+    kernels: dict[str, np.ndarray] = {}
     try:
         with fits.open(temporary, mode="append") as file:
             file.append(fits.PrimaryHDU(header=fits.Header([("DETECTOR", sca, "SCA, 1-18")])))
@@ -96,13 +110,13 @@ def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source
                     hdu = fits.ImageHDU(name=extension.name)
                     hdu.header["VALID"] = (False, extension.text)
                 elif extension.name in FLAT:
-                    hdu = fits.ImageHDU(flat(last.pop(FLAT[extension.name])), name=extension.name)
+                    hdu = fits.ImageHDU(flat(kernels.pop(FLAT[extension.name])), name=extension.name)
                 else:
-                    name, values = next(given)
+                    name, values = next(remaining)
                     if (name, values.shape, values.dtype) != (extension.name, extension.shape, extension.dtype):
                         raise ValueError(f"{name} {values.dtype} {values.shape}: expected {extension}")
                     if name in FLAT.values():
-                        last[name] = values
+                        kernels[name] = values
                     hdu = fits.ImageHDU(values, name=name)
                 hdu.header["COMMENT"] = extension.text
                 hdu.add_checksum()
@@ -115,12 +129,13 @@ def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source
 
 
 def check(path: AnyPath) -> None:
-    """Check that a file has every extension of table 1, in its order, with its type and shape; read no values.
+    """Check that a file has the extensions of TABLE, with their order, types and shapes, without reading values.
 
     Raises
     ------
     UserError
-        That names the file, the extension, what was found, and what is expected.
+        If the file is not FITS, or an extension is missing, misplaced or of another type or shape. The message names
+        the file and the extension, and says what was found and what is expected.
     """
     try:
         with fits.open(local_copy(path), lazy_load_hdus=False) as file:
@@ -145,21 +160,21 @@ def _check_values(path: AnyPath, header: fits.Header, extension: Extension) -> N
     shape = tuple(header.get(f"NAXIS{k}", 0) for k in range(header.get("NAXIS", 0), 0, -1))
     if shape != extension.shape:
         raise UserError(f"{path}: {extension.name} has shape {shape}, expected {extension.shape}")
-    kind = header["BITPIX"], int(header.get("BZERO", 0))
-    if kind != _BITPIX[extension.dtype]:
+    bitpix, bzero = header["BITPIX"], int(header.get("BZERO", 0))
+    if (bitpix, bzero) != _BITPIX[extension.dtype]:
         raise UserError(
-            f"{path}: {extension.name} has BITPIX {kind[0]} and BZERO {kind[1]}, expected "
+            f"{path}: {extension.name} has BITPIX {bitpix} and BZERO {bzero}, expected "
             f"{_BITPIX[extension.dtype][0]} and {_BITPIX[extension.dtype][1]} ({extension.dtype})"
         )
 
 
 def read(path: AnyPath, name: str) -> np.ndarray:
-    """Return the values of an extension, in the machine's byte order.
+    """Return the values of an extension, in native byte order.
 
     Raises
     ------
     UserError
-        If they are not finite, or the extension's checksum does not match.
+        If the extension cannot be read, its checksum does not match, or it has values that are not finite.
     """
     extension = BY_NAME[name]
     try:
@@ -167,10 +182,10 @@ def read(path: AnyPath, name: str) -> np.ndarray:
             hdu = file[name]
             _check_values(path, hdu.header, extension)
             values = np.asarray(hdu.data).astype(extension.dtype, copy=False)
-            stored = hdu.header.get("DATASUM")
+            datasum = hdu.header.get("DATASUM")
     except (OSError, KeyError, TypeError) as error:
         raise UserError(f"{path}: {name} cannot be read ({error})") from None
-    if stored is not None and _datasum(path, name) != stored:
+    if datasum is not None and _datasum(path, name) != datasum:
         raise UserError(f"{path}: {name} is damaged (its checksum does not match): fetch or make the file again")
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).sum())

@@ -1,4 +1,4 @@
-"""Where the calibrations of Roman's SCAs come from: a folder of files, or made-up SCAs of a seed."""
+"""Source of the calibrations of Roman's SCAs: a folder of files, or synthetic calibrations drawn from a seed."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from romandask.storage.paths import AnyPath, file_state
 
 @dataclass(frozen=True)
 class CalibrationSource:
-    """The calibrations of all SCAs."""
+    """Source of the calibrations of all SCAs."""
 
     folder: AnyPath | None
-    """Of files sca01.fits to sca18.fits; None for made-up SCAs."""
+    """Folder of the files sca01.fits to sca18.fits; None for synthetic calibrations."""
     seed: int
-    """Of those."""
+    """Seed of the synthetic calibrations."""
 
     def check(self, scas: Iterable[int]) -> None:
-        """Check that there is a file for every one of some SCAs, laid out as it should be; read no values.
+        """Check that the files of some SCAs exist and have the layout of `calibration_files`, without reading values.
 
         Raises
         ------
         UserError
-            That names the folder or file, what was found and what to do.
+            If the folder or a file is missing, or a file has another layout. The message says what was found and what
+            to do.
         """
         if self.folder is None:
             return
@@ -50,7 +51,7 @@ class CalibrationSource:
             check(path_of(self.folder, sca))
 
     def planes(self, sca: int) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield names and values of the calibrations of an SCA, in the order of the paper's table 1."""
+        """Yield names and values of the calibrations of an SCA, in the order of table 1 of Troxel et al. (2023)."""
         if self.folder is None:
             yield from planes(partial(rng, self.seed, "calibration", sca))
             return
@@ -59,11 +60,14 @@ class CalibrationSource:
                 yield extension.name, read(path_of(self.folder, sca), extension.name)
 
     def diffusion(self, sca: int) -> float:
-        """Return sigma, pixels, of the diffusion of charge: that of the mean covariance of an SCA (CHRGDIFF)."""
+        """Return sigma of the charge diffusion, pixels, from the covariance (CHRGDIFF) averaged over an SCA."""
         return _diffusion(self, sca)
 
     def state(self, sca: int) -> Any:
-        """Return what identifies the calibrations of an SCA, without reading them."""
+        """Return a value that identifies the calibrations of an SCA, for the input hash, without reading them.
+
+        It is the seed, or the path and the state (size, time) of the file.
+        """
         if self.folder is None:
             return self.seed
         path = path_of(self.folder, sca)

@@ -1,8 +1,9 @@
-"""How an SCA turns light into an exposure, with the calibrations of its product and what earlier exposures left.
+"""Readout of Roman's SCAs with the full detector model: calibrations, and persistence of earlier exposures.
 
-Exposures of one SCA follow one another: charge that one leaves in traps comes out in those after it. What each leaves
-is written with it, a small table, and depends on nothing that was there before (of trapped charge a thousandth would be
-trapped again), so that an exposure needs those tables alone and none is drawn twice.
+Charge that an exposure leaves in traps is released in later exposures of the same SCA. Each exposure stores a small
+table of this charge. The table depends only on the light of that exposure: charge from earlier exposures that would be
+trapped again, about a thousandth, is neglected. An exposure therefore needs only the tables of earlier exposures, and
+no exposure is drawn twice.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import pandas as pd
 import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.instrument import Instrument, Light
+from romandask.instruments.instrument import Instrument
+from romandask.instruments.readout import Light
 from romandask.instruments.roman.calibration import unit_name
 from romandask.kernels.detectors.cosmic_rays import hits, tracks
 from romandask.kernels.detectors.sca import MEMORY, band_mean
@@ -40,28 +42,48 @@ from romandask.products.schemas import schema
 from romandask.storage.arrays import ROWS_A_FILE, Variable
 
 DAY = 86400.0
-"""Seconds."""
+"""One day, seconds."""
 
 
 def before(table: pd.DataFrame, index: int) -> np.ndarray:
-    """Return the rows of a pointings table whose afterglow is in the exposure of a row, in order of time.
+    """Return the earlier exposures whose persistence is simulated in an exposure.
 
-    They are those of the same detector that ended within MEMORY exposure times before it began.
+    They are the exposures of the same detector that ended at most MEMORY exposure times before the exposure begins.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Pointings (schema: catalogs/pointings.yaml).
+    index : int
+        Row of the exposure.
+
+    Returns
+    -------
+    ndarray of int
+        Rows of the earlier exposures, in order of time.
     """
     start, exptime = table["mjd"].to_numpy(float) * DAY, table["exptime"].to_numpy(float)
     gap = start[index] - start - exptime
     same = table["detector"].to_numpy() == table["detector"].iat[index]
-    found = np.flatnonzero(same & (start < start[index]) & (gap <= MEMORY * exptime[index]))
-    return found[np.argsort(start[found], kind="stable")]
+    rows = np.flatnonzero(same & (start < start[index]) & (gap <= MEMORY * exptime[index]))
+    return rows[np.argsort(start[rows], kind="stable")]
 
 
 def age(earlier: Exposure, later: Exposure) -> float:
-    """Return the seconds from the end of an exposure to the middle of a later one, a second in the least."""
+    """Return the time from the end of an exposure to the middle of a later one, seconds, at least one second."""
     return max((later.mjd - earlier.mjd) * DAY + later.exptime / 2 - earlier.exptime, 1.0)
 
 
 def age_and_traps(exposure: Exposure, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> list[tuple[Trapped, float]]:
-    """Return what exposures before one left, each with its age (s) in the middle of that one."""
+    """Return the trapped charge of earlier exposures, each with its `age` in an exposure, seconds.
+
+    Parameters
+    ----------
+    exposure : Exposure
+        The exposure in which the charge is released.
+    left : sequence of (Exposure, DataFrame)
+        Earlier exposures, each with its table of trapped charge.
+    """
     return [
         (Trapped(table["pixel"].to_numpy(), table["charge"].to_numpy()), age(earlier, exposure))
         for earlier, table in left
@@ -69,19 +91,22 @@ def age_and_traps(exposure: Exposure, left: Sequence[tuple[Exposure, pd.DataFram
 
 
 def trapped_table(charge: np.ndarray, planes: Planes) -> pd.DataFrame:
-    """Return what stays in traps of a charge (4096, 4096), electrons (schema: catalogs/trapped.yaml)."""
+    """Return the trapped part of a charge (4096, 4096), electrons, as a table (schema: catalogs/trapped.yaml)."""
     return pd.DataFrame(vars(trap(charge, planes)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScaReadout:
-    """Reads out exposures with every effect of their SCA."""
+    """Readout of Roman's SCAs with all detector effects; implements `Readout`."""
 
     instrument: Instrument
+    """The instrument Roman."""
     calibration: ImageProduct
-    """What `calibrations()` returned."""
+    """Calibrations of the SCAs, from `calibration.calibrations`."""
     seed: int
+    """Seed of the survey."""
     cosmic_rays: bool
+    """True to add cosmic rays."""
     seconds_per_pixel: float = 7e-7
 
     @property
@@ -99,108 +124,133 @@ class ScaReadout:
 
     @property
     def tables(self) -> dict[str, pa.Schema]:
-        """Charge that stays in traps."""
+        """Table of the charge that stays in traps."""
         return {"trapped": schema("trapped")}
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Whether there are cosmic rays."""
+        """Whether cosmic rays are added."""
         return {"cosmic_rays": self.cosmic_rays}
 
     def earlier(self, table: pd.DataFrame, row: int) -> np.ndarray:
-        """Return the rows of the exposures of the same SCA whose afterglow an exposure has, in order of time."""
+        """Return the rows of the earlier exposures with persistence in an exposure; see `before`."""
         return before(table, row)
 
     def inputs(self, exposure: Exposure) -> tuple[tuple[str, str], ...]:
-        """Return the calibration of the exposure's SCA."""
+        """Return the unit of the calibration of an exposure's SCA."""
         return ((self.calibration.stage, self.calibration.names[self.unit(exposure)]),)
 
     def leave(self, light: Light) -> pd.DataFrame:
-        """Return the charge that an exposure leaves in traps: it depends on its own light alone."""
+        """Return the table of the charge that an exposure leaves in traps; it depends only on the light given."""
         planes = self.planes(light.exposure)
         electrons, response = light.expected() + light.background, self.response(light.exposure, planes)
         return trapped_table(self.charge(light.exposure, electrons, planes, response)[0], planes)
 
     def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
-        """Return raw, image, truth, variance, dq and the table of trapped charge of an exposure."""
+        """Return raw, image, truth, variance, dq and the table `trapped` of an exposure."""
         expected = light.expected()
         return {**self.read(light.exposure, expected + light.background, left), "truth": expected}
 
     def unit(self, exposure: Exposure) -> int:
-        """Return the number of an exposure's SCA in the calibrations."""
+        """Return the index of the calibration unit of an exposure's SCA."""
         return self.calibration.names.index(unit_name(exposure.detector))
 
     def charge(
         self, exposure: Exposure, light: np.ndarray, planes: Planes, response: Response
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return what light (electrons) leaves in the pixels, and what of it is cosmic rays' (both (4096, 4096))."""
+        """Return the charge in the pixels before readout, and the part of it from cosmic rays.
+
+        Parameters
+        ----------
+        exposure : Exposure
+            The exposure.
+        light : ndarray, shape (4088, 4088), electrons
+            Expected electrons of objects, sky and thermal emission.
+        planes : Planes
+            Calibrations of the SCA.
+        response : Response
+            Response of the SCA in the band.
+
+        Returns
+        -------
+        charge : ndarray, shape (4096, 4096), electrons
+        rays : ndarray, shape (4096, 4096), electrons, or None
+            None without cosmic rays.
+        """
         rays = self.rays(exposure)
         return accumulate(light, planes, response, partial(self.random, exposure), rays), rays
 
     def rays(self, exposure: Exposure) -> np.ndarray | None:
-        """Return the electrons (4096, 4096) of cosmic rays; None where there are to be none."""
+        """Return the electrons (4096, 4096) of cosmic rays; None without cosmic rays."""
         if not self.cosmic_rays:
             return None
-        return hits(
-            SCA_SHAPE,
-            tracks(SCA_SHAPE, exposure.exptime, self.random(exposure, "rays", 0)),
-        )
+        return hits(SCA_SHAPE, tracks(SCA_SHAPE, exposure.exptime, self.random(exposure, "rays", 0)))
 
     def read(
         self, exposure: Exposure, light: np.ndarray, left: Sequence[tuple[Exposure, pd.DataFrame]]
     ) -> dict[str, Any]:
-        """Return raw, image, variance, dq and the table of trapped charge of an exposure.
+        """Return raw, image, variance, dq and the table `trapped` of an exposure.
 
         Parameters
         ----------
-        light : (4088, 4088) expected electrons of objects, sky and thermal emission
-        left : exposures before it and what they left
+        exposure : Exposure
+            The exposure.
+        light : ndarray, shape (4088, 4088), electrons
+            Expected electrons of objects, sky and thermal emission.
+        left : sequence of (Exposure, DataFrame)
+            Earlier exposures, each with its table of trapped charge.
         """
         planes = self.planes(exposure)
         response = self.response(exposure, planes)
         charge, rays = self.charge(exposure, light, planes, response)
-        late = afterglow(age_and_traps(exposure, left))
+        persistence = afterglow(age_and_traps(exposure, left))
         trapped = trapped_table(charge, planes)
-        raw, dq = read_out(charge, planes, response, partial(self.random, exposure), late, rays)
-        del charge, rays, late
+        raw, dq = read_out(charge, planes, response, partial(self.random, exposure), persistence, rays)
+        # free the memory before the calibration
+        del charge, rays, persistence
         image, variance = calibrate(raw, planes, response)
         return {"raw": raw, "image": image, "variance": variance, "dq": dq, "trapped": trapped}
 
     def planes(self, exposure: Exposure) -> Planes:
-        """Return the calibrations of an exposure's SCA, some rows at a time."""
+        """Return the function that reads rows of the calibrations of an exposure's SCA."""
         product, index = self.calibration, self.unit(exposure)
         axes = {variable.name: variable.axes for variable in product.variables}
         if not product.has(index):
-            whole = _made(product.make, index)
+            made = _made(product.make, index)
 
-            def of_whole(name: str, rows: slice) -> np.ndarray:
-                return whole[name][..., rows, :] if axes[name][-1] == "x" else whole[name]
+            def made_rows(name: str, rows: slice) -> np.ndarray:
+                return made[name][..., rows, :] if axes[name][-1] == "x" else made[name]
 
-            return of_whole
+            return made_rows
 
-        # what is asked for a few rows at a time, in their order, is read as it is stored
+        # rows are requested a few at a time in increasing order: the rows of the last file are kept for each array,
+        # with the number of the file
         read = product.reader(index)
-        last: dict[str, tuple[int, np.ndarray]] = {}
+        kept: dict[str, tuple[int, np.ndarray]] = {}
 
-        def of_store(name: str, rows: slice) -> np.ndarray:
+        def stored_rows(name: str, rows: slice) -> np.ndarray:
             if axes[name][-1] != "x":
-                if name not in last:
-                    last[name] = 0, read(name, ())
-                return last[name][1]
-            everything = slice(None)
+                if name not in kept:
+                    kept[name] = 0, read(name, ())
+                return kept[name][1]
+            all_columns = slice(None)
             if rows == slice(None) or rows.start // ROWS_A_FILE != (rows.stop - 1) // ROWS_A_FILE:
-                return read(name, (rows, everything))
-            part = rows.start // ROWS_A_FILE
-            if name not in last or last[name][0] != part:
-                last.pop(name, None)
-                last[name] = part, read(name, (slice(part * ROWS_A_FILE, (part + 1) * ROWS_A_FILE), everything))
-            first = part * ROWS_A_FILE
-            return last[name][1][..., rows.start - first : rows.stop - first, :]
+                return read(name, (rows, all_columns))
+            file = rows.start // ROWS_A_FILE
+            first = file * ROWS_A_FILE
+            if name not in kept or kept[name][0] != file:
+                # free the memory before reading
+                kept.pop(name, None)
+                kept[name] = file, read(name, (slice(first, first + ROWS_A_FILE), all_columns))
+            return kept[name][1][..., rows.start - first : rows.stop - first, :]
 
-        return of_store
+        return stored_rows
 
     def response(self, exposure: Exposure, planes: Planes) -> Response:
-        """Return how an SCA answers the light of a band: means over its photons of a flat spectrum."""
+        """Return the response of an SCA in the band of an exposure, averaged over the photons of a flat f_nu spectrum.
+
+        A source of flat f_nu has a photon density proportional to 1 / wavelength.
+        """
         band = self.instrument.bandpass(exposure.band)
         efficiency, electrons = (
             band_mean(planes(name, slice(None)), WAVES, band.wave, band.weights / band.wave).astype(np.float32)
@@ -209,12 +259,12 @@ class ScaReadout:
         return Response(efficiency, electrons, exposure.exptime)
 
     def random(self, exposure: Exposure, step: str, block: int) -> np.random.Generator:
-        """Return the random generator of a step and block of rows of an exposure."""
+        """Return the random generator of a block of rows in a step of an exposure."""
         name = self.instrument.name
         return rng(self.seed, "exposures", name, exposure.visit, exposure.detector, step, block)
 
 
 @lru_cache(maxsize=1)
 def _made(make: Callable[[int], dict[str, Any]], index: int) -> dict[str, np.ndarray]:
-    """Return the calibrations of an SCA that are not stored: long in the making, so kept until the next SCA's."""
+    """Return the calibrations of an SCA that are not stored; cached, because they take long to make."""
     return make(index)

@@ -1,4 +1,4 @@
-"""Where the Sun lets Roman look, and how Roman then rolls: GalSim's ephemeris, for any number of visits at once."""
+"""Sun angle and roll of Roman's visits, with the ephemeris of GalSim, vectorised over visits."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import numpy as np
 from coord import degrees
 from coord.util import ecliptic_obliquity
 from galsim.roman.roman_wcs import theta_fpa
+from numpy.typing import ArrayLike
 
 from romandask.instruments.roman.focal_plane import axes
 from romandask.model.sky import unit_vectors
 
 NEAREST, FURTHEST = 90 - galsim.roman.max_sun_angle, 90 + galsim.roman.max_sun_angle
-"""Angle between the Sun and the boresight, degrees."""
+"""Smallest and largest angle between the Sun and the boresight, degrees."""
 LARGEST_ROLL = 15.0
-"""The roll may differ this much, degrees, from the one that turns the solar panels to the Sun."""
+"""Largest difference of the roll from the best roll, at which the solar panels face the Sun, degrees."""
 
 
-def sun_vectors(mjd) -> np.ndarray:
-    """Return the unit vectors (..., 3) from the Earth to the Sun at some MJD, as GalSim's pointing rules take them."""
-    # GalSim passes dates on as calendar dates without fractions of a second, and takes the obliquity of the year
+def sun_vectors(mjd: ArrayLike) -> np.ndarray:
+    """Return unit vectors (..., 3) from the Earth to the Sun at times, MJD, as GalSim's pointing rules use them."""
+    # GalSim truncates times to whole seconds and uses the obliquity at the start of the year
     days = np.floor(np.asarray(mjd, dtype=float) * 86400 + 5e-7) / 86400 - 51544.5
     anomaly = np.radians(357.528 + 0.9856003 * days)
     longitude = np.radians(280.46 + 0.9856474 * days + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly))
@@ -29,39 +30,73 @@ def sun_vectors(mjd) -> np.ndarray:
     return np.stack([np.cos(longitude), np.sin(longitude) * np.cos(tilt), np.sin(longitude) * np.sin(tilt)], axis=-1)
 
 
-def sun_angle(ra, dec, mjd) -> np.ndarray:
-    """Return the angle between positions and the Sun at some MJD, degrees."""
-    sun, there = np.broadcast_arrays(sun_vectors(mjd), unit_vectors(ra, dec))
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(sun, there), axis=-1), (sun * there).sum(-1)))
+def sun_angle(ra: ArrayLike, dec: ArrayLike, mjd: ArrayLike) -> np.ndarray:
+    """Return the angle between positions and the Sun, degrees.
+
+    Parameters
+    ----------
+    ra, dec : array-like, degrees
+        Positions.
+    mjd : array-like, MJD
+        Times.
+    """
+    sun, position = np.broadcast_arrays(sun_vectors(mjd), unit_vectors(ra, dec))
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(sun, position), axis=-1), (sun * position).sum(-1)))
 
 
-def best_roll(ra, dec, mjd) -> np.ndarray:
-    """Return the position angle (degrees) of the focal plane with the solar panels facing the Sun.
+def best_roll(ra: ArrayLike, dec: ArrayLike, mjd: ArrayLike) -> np.ndarray:
+    """Return the position angle of the focal plane, degrees, at which the solar panels face the Sun.
 
-    The observatory's +Z axis points from the field to the Sun, and the focal plane is turned by theta_fpa = 120 degrees
-    from it: observing sequences of the mission's reference survey follow this within the allowed roll of 15 degrees.
-    (galsim.roman.bestPA has the opposite sign of the angle, and turns it by 180 degrees where the Sun is more than
-    90 degrees away.)
+    The +Z axis of the observatory points from the field towards the Sun, and the focal plane is rotated from it by
+    theta_fpa = 120 degrees. The observing sequences of the mission's reference survey follow this rule within the
+    allowed roll of 15 degrees. (`galsim.roman.bestPA` has the opposite sign of the angle, and differs by 180 degrees
+    where the Sun is more than 90 degrees away.)
+
+    Parameters
+    ----------
+    ra, dec : array-like, degrees
+        Positions of the centre of the focal plane.
+    mjd : array-like, MJD
+        Times.
     """
     _, east, north = axes(ra, dec)
     sun = sun_vectors(mjd)
     return (np.degrees(np.arctan2((sun * east).sum(-1), (sun * north).sum(-1))) + theta_fpa / degrees) % 360
 
 
-def roll_offset(ra, dec, pa, mjd) -> np.ndarray:
-    """Return by how much position angles of the focal plane differ from the best roll, degrees in -180..180."""
-    return (pa - best_roll(ra, dec, mjd) + 180) % 360 - 180
+def roll_offset(ra: ArrayLike, dec: ArrayLike, pa: ArrayLike, mjd: ArrayLike) -> np.ndarray:
+    """Return the difference of position angles of the focal plane from the best roll, degrees, -180 to 180.
+
+    Parameters
+    ----------
+    ra, dec, pa : array-like, degrees
+        Positions of the centre of the focal plane, and its position angles.
+    mjd : array-like, MJD
+        Times.
+    """
+    return (np.asarray(pa) - best_roll(ra, dec, mjd) + 180) % 360 - 180
 
 
-def leads(ra, dec, mjd) -> np.ndarray:
-    """True where the Sun is to the ecliptic east of a position: the leading season, of the two in a year."""
-    sun, there = sun_vectors(mjd), unit_vectors(ra, dec)
-    year_tilt = _obliquity(2000)
-    pole = np.array([0.0, -np.sin(year_tilt), np.cos(year_tilt)])
-    return (np.cross(there, sun) * pole).sum(-1) > 0
+def leads(ra: ArrayLike, dec: ArrayLike, mjd: ArrayLike) -> np.ndarray:
+    """Return a mask of the times at which the Sun is east of a position in ecliptic longitude: the leading season.
+
+    A position can be observed in two seasons per year; in the other one the Sun is to the west.
+
+    Parameters
+    ----------
+    ra, dec : array-like, degrees
+        Positions.
+    mjd : array-like, MJD
+        Times.
+    """
+    sun, position = sun_vectors(mjd), unit_vectors(ra, dec)
+    tilt = float(_obliquity(np.array(2000)))
+    pole = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    return (np.cross(position, sun) * pole).sum(-1) > 0
 
 
-def _obliquity(year) -> np.ndarray:
-    years, places = np.unique(year, return_inverse=True)
-    values = np.array([ecliptic_obliquity(int(one)).rad for one in years])
-    return values[places].reshape(np.shape(year))
+def _obliquity(year: np.ndarray) -> np.ndarray:
+    """Return the obliquity of the ecliptic in calendar years, radians."""
+    years, index = np.unique(year, return_inverse=True)
+    values = np.array([ecliptic_obliquity(int(number)).rad for number in years])
+    return values[index].reshape(year.shape)

@@ -1,8 +1,13 @@
-"""Rubin's bands: what differs from band to band and is not in GalSim's throughputs. A new band is one entry here."""
+"""Rubin's bands: constants of each filter that are not in GalSim's throughputs. A new band is one entry of `BANDS`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
+
+COLLECTING_AREA = np.pi / 4 * 642.3**2
+"""Effective collecting area of the telescope, cm2."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -10,35 +15,40 @@ class RubinBand:
     """One filter of the LSST camera."""
 
     name: str
+    """Name of the filter."""
     effective_wave: float
-    """nm"""
+    """Effective wavelength, nm."""
     visits: int
-    """Mean visits of a point in five years of the wide-fast-deep survey."""
+    """Mean number of visits of a point in five years of the wide-fast-deep survey."""
     depth_30s: float
-    """m5 of 30 s at zenith, sky 21 mag / arcsec2 and FWHMeff 0.7 arcsec, AB mag.
+    """5-sigma depth m5 of 30 s at zenith, with a sky of 21 mag / arcsec2 and FWHMeff of 0.7 arcsec, AB mag.
 
-    rubin_scheduler's SysEngVals (syseng_throughputs 1.7), with which OpSim's runs up to version 3.2 were made. Ivezic
-    et al. (2019, table 2) have 23.09, 24.42, 24.44, 24.32, 24.16, 23.73; SMTN-002 (throughputs 1.9: three silver
-    mirrors) has 22.97, 24.58, 24.60, 24.54, 24.37, 23.84.
+    The values are rubin_scheduler's SysEngVals (syseng_throughputs 1.7), with which OpSim's runs up to version 3.2 were
+    made. Ivezic et al. (2019, table 2) give 23.09, 24.42, 24.44, 24.32, 24.16, 23.73 for ugrizy; SMTN-002 (throughputs
+    1.9, three silver mirrors) gives 22.97, 24.58, 24.60, 24.54, 24.37, 23.84.
     """
     extinction: float
-    """k_m, mag an airmass (SysEngVals)."""
+    """Atmospheric extinction k_m, mag per airmass (SysEngVals)."""
     read_loss: float
-    """Depth that the read noise of 30 s in the dark costs, mag: SMTN-002's dC_m^inf (SysEngVals)."""
+    """Loss of depth by the read noise of 30 s in the dark, mag; dC_m^inf of SMTN-002 (SysEngVals)."""
     dark_sky: float
     """Dark zenith sky at which `read_loss` holds, AB mag / arcsec2 (SysEngVals)."""
     airglow: float
-    """Dark zenith sky of the generated cadence, AB mag / arcsec2 (SMTN-002; u and z from PSTN-054, table 3: OpSim's sky
-    model is brighter there)."""
+    """Dark zenith sky of the generated cadence, AB mag / arcsec2.
+
+    The values are from SMTN-002; those of u and z are from PSTN-054, table 3, because OpSim's sky model is brighter
+    there.
+    """
     sun: float
     """AB magnitude of the Sun (Willmer 2018)."""
     sun_limit: float
-    """Altitude of the Sun, degrees, above which the band is not used."""
+    """Altitude of the Sun above which the band is not used, degrees."""
     moonlight_choice: tuple[float, float, float, float]
-    """How often, over its share of the visits, the band is chosen at the values `cadence.MOONLIGHT` of moonlight.
+    """Relative frequency with which the band is chosen at each value of `cadence.MOONLIGHT`, in units of its share of
+    the visits.
 
-    Set so that medians of the sky brightness are near those of OpSim's baseline 2.0 (PSTN-054, table 3: 22.59, 21.98,
-    20.94, 20.01, 18.80, 18.20): u and g in the dark, z and y in moonlight and twilight.
+    The values are set so that the median sky brightnesses are near those of OpSim's baseline 2.0 (PSTN-054, table 3:
+    22.59, 21.98, 20.94, 20.01, 18.80, 18.20): u and g in the dark, z and y in moonlight and twilight.
     """
 
 
@@ -125,8 +135,8 @@ BANDS: dict[str, RubinBand] = {
         ),
     )
 }
-"""In order of wavelength."""
+"""Bands by name, in order of wavelength."""
 REFERENCE_BAND = "i"
 """Band in which objects are counted and compared with the truth."""
 COLOUR_BAND = "g"
-"""Band of the colour between Rubin's and Roman's counterparts of an object."""
+"""Band for the colour of an object between its counterparts in Rubin and Roman."""

@@ -1,67 +1,90 @@
-"""Rubin's generated cadence: nights, filter changes and the visits of a fixed field grid.
+"""Rubin's generated cadence: nights, filter changes, and the visits of a fixed grid of fields.
 
-The survey is drawn in two steps, neither of which knows the region. First the whole observatory's filter blocks: each
-night is cut at its filter changes, and a block has one filter, one rotator angle and one seeing. Then each field draws
-its visits from the blocks in which it can be observed. A visit is thus the same whatever part of the sky asks for it.
+The survey is drawn in two steps, neither of which depends on the region. The first step draws the filter blocks of the
+whole survey: each night is divided at its filter changes, and a block has one filter, one rotator angle and one seeing.
+In the second step, each field draws its visits from the blocks in which it can be observed. A visit is therefore the
+same for every region that includes it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol, cast
 
 import numpy as np
 import pandas as pd
 
 from romandask.instruments.rubin.bands import BANDS
+from romandask.instruments.rubin.site_sky import (
+    LATITUDE,
+    LONGITUDE,
+    altitude,
+    moon_position,
+    moonlight,
+    parallactic_angle,
+    sky_brightness,
+    sun_position,
+)
 from romandask.model.seeds import rng
 from romandask.model.sky import Region, unit_vectors
 
-LATITUDE, LONGITUDE = -30.2446, -70.7494
-"""Cerro Pachon, degrees (LSST Key Numbers)."""
 YEARS = 5
+"""Duration of the survey, years."""
 NIGHTS = round(YEARS * 365.25)
+"""Duration of the survey, nights."""
 BLOCK = 0.75 / 24
-"""Days between filter changes: about ten a night, as in OpSim's baselines."""
+"""Time between filter changes, days: about ten changes per night, as in OpSim's baselines."""
 CLEAR = 0.8
-"""Share of the nights that are observed: weather and engineering take the others."""
+"""Fraction of the nights on which the survey observes; the others are lost to weather and engineering."""
 SPACING = 2.8
-"""Of the fields, degrees: a cell is four fifths of the field of view, so neighbours overlap."""
+"""Spacing of the fields, degrees. A cell of the grid is four fifths of the field of view, so neighbours overlap."""
 AIRMASS = 1.5
-"""Limit of a field's blocks; a dithered visit may exceed it slightly."""
+"""Maximum airmass of a field; that of a dithered visit may be slightly larger."""
 LOWEST_TRANSIT = 30.0
-"""Fields that never rise higher, degrees, are not visited."""
+"""Altitude of transit below which a field is not visited, degrees."""
 MOON_DISTANCE = 30.0
-"""No visit is closer to the Moon when it is up, degrees (OpSim's baselines)."""
+"""Minimum distance of a field from the Moon when the Moon is up, degrees (OpSim's baselines)."""
 ROTATOR = 80.0
-"""Range of the random rotator angle at a filter change, degrees either way (Awan et al. 2016; the limit is 90)."""
+"""Largest absolute value of the random rotator angle at a filter change, degrees (Awan et al. 2016; the limit of the
+telescope is 90)."""
 SEEING_NIGHT, SEEING_BLOCK = 0.22, 0.18
-"""Scatter of ln(seeing) between and within nights: 0.28 in all, the quartiles of PSTN-054's table 3."""
+"""Scatter of ln(seeing) between nights and within a night; 0.28 in quadrature, from the quartiles of PSTN-054, table 3.
+"""
 SKY_SCATTER = 0.05
-"""mag"""
-SUN_V = -26.76
-"""AB magnitude of the Sun in V (Willmer 2018)."""
-EXTINCTION_V = 0.172
-"""mag an airmass, of Krisciunas & Schaefer (1991)."""
+"""Scatter of the sky brightness, mag."""
 MOONLIGHT = (0.0, 0.1, 0.3, 0.8)
 """Values of `moonlight` at which `RubinBand.moonlight_choice` is given."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """Times between filter changes; arrays of one length."""
+    """The n times between filter changes, in which the filter, the rotator angle and the seeing are constant."""
 
     night: np.ndarray
-    """Since the start of the survey."""
+    """Number of the night since the start of the survey, shape (n,)."""
     start: np.ndarray
-    """MJD"""
+    """Start of the block, shape (n,), MJD."""
     band: np.ndarray
+    """Band, shape (n,)."""
     rotator: np.ndarray
-    """Rotator angle (OpSim's rotTelPos), degrees."""
+    """Rotator angle (rotTelPos in OpSim), shape (n,), degrees."""
     seeing: np.ndarray
-    """FWHM at 500 nm and zenith, arcsec."""
+    """FWHM of the atmospheric PSF at 500 nm and zenith, shape (n,), arcsec."""
     dither: np.ndarray
-    """(n, 2) of the night: shifts in right ascension and declination, in cells of the field grid, -1/2 to 1/2."""
+    """Dither of the night, shape (n, 2): shifts in right ascension and declination, in units of a cell of the field
+    grid, -1/2 to 1/2."""
+
+
+class _Field(Protocol):
+    """A row of `near_fields`."""
+
+    number: int
+    ra: float
+    dec: float
+    cell: float
+    width: float
+    height: float
 
 
 def cadence(
@@ -74,16 +97,32 @@ def cadence(
     area: float,
     radius: float,
 ) -> pd.DataFrame:
-    """Return the visits of five years that may reach a region, by time (columns of Exposure without the detector).
+    """Generate the visits of five years that may reach a region.
 
     Parameters
     ----------
-    bands : of the visits that are wanted
-    start : MJD of the first night
-    means : mean visits of a point, by band: of all bands, for they share the nights
-    seeing : median FWHM at 500 nm and zenith, arcsec
-    area : of the detectors, square degrees
-    radius : from the region within which visits may matter, degrees
+    region : Region
+        Region to cover.
+    seed : int
+        Seed of the survey.
+    bands : sequence of str
+        Bands of the visits to return.
+    start : float, MJD
+        First night.
+    means : dict of str to int
+        Mean number of visits of a point in each band; includes bands that are not returned, because all bands share the
+        nights.
+    seeing : float, arcsec
+        Median FWHM of the atmospheric PSF at 500 nm and zenith.
+    area : float, square degrees
+        Total area of the detectors.
+    radius : float, degrees
+        Distance from the region up to which visits are returned.
+
+    Returns
+    -------
+    DataFrame
+        One row per visit in order of time, with the fields of `Exposure` except `detector`.
     """
     blocks = filter_blocks(seed, start, means, seeing)
     ends = [blocks.start, blocks.start + BLOCK]
@@ -91,61 +130,93 @@ def cadence(
     centre = unit_vectors(*region.centre)
     edge = _edge(region)
     reach = np.arccos(np.clip((edge @ centre).min(), -1, 1)) + np.radians(radius)
-    cells = _along_curve(blocks.dither)
+    curve_positions = _morton_position(blocks.dither)
     parts = []
-    for field in near_fields(region.centre, np.degrees(reach)).itertuples():
-        fit = _observable(field, ends, moon)
+    for row in near_fields(region.centre, np.degrees(reach)).itertuples():
+        # the stubs of pandas do not know the columns of a row
+        field = cast(_Field, row)
+        observable = _observable(field, ends, moon)
         for band in bands:
-            candidates = np.flatnonzero(fit & (blocks.band == band))
-            chosen = _chosen(field, band, candidates, cells, seed, means[band] / area)
+            candidates = np.flatnonzero(observable & (blocks.band == band))
+            chosen = _choose(field, band, candidates, curve_positions, seed, means[band] / area)
             if len(chosen.blocks):
                 parts.append(_visits(field, band, blocks, chosen))
     if not parts:
-        return pd.DataFrame({name: np.empty(0, kind) for name, kind in _DTYPES.items()})
+        return pd.DataFrame({name: np.empty(0, dtype) for name, dtype in _DTYPES.items()})
     visits = pd.concat(parts)
     visits = visits[unit_vectors(visits["ra"], visits["dec"]) @ centre >= np.cos(min(reach, np.pi))]
     return visits.sort_values(["mjd", "visit"], ignore_index=True)
 
 
-_DTYPES = {"visit": np.int64, "band": object} | dict.fromkeys(
-    ("mjd", "exptime", "ra", "dec", "pa", "seeing", "airmass", "sky_brightness"), float
-)
+_DTYPES: dict[str, type] = {
+    "visit": np.int64,
+    "band": object,
+    **dict.fromkeys(("mjd", "exptime", "ra", "dec", "pa", "seeing", "airmass", "sky_brightness"), float),
+}
+"""Columns and dtypes of a table of visits."""
 
 
 def filter_blocks(seed: int, start: float, means: Mapping[str, int], seeing: float) -> Blocks:
-    """Return the blocks of the survey: they depend on the seed and the settings only."""
+    """Draw the filter blocks of the survey.
+
+    Parameters
+    ----------
+    seed, start, means, seeing
+        As in `cadence`.
+    """
     random = rng(seed, "pointings", "rubin", "nights")
     clear = random.random(NIGHTS) < CLEAR
     dither = random.uniform(-0.5, 0.5, (NIGHTS, 2))
-    nightly = SEEING_NIGHT * random.standard_normal(NIGHTS)
+    night_scatter = SEEING_NIGHT * random.standard_normal(NIGHTS)
     count = int(1 / BLOCK)
-    # a night begins at noon; filter changes fall at its own phase
+    # a night begins at noon; the phase of the filter changes is drawn for each night
     noon = np.floor(start) - LONGITUDE / 360 + 0.5 + np.arange(NIGHTS) - 1
     times = noon[:, None] + (np.arange(count) + random.random((NIGHTS, 1))) * BLOCK
     rotator = random.uniform(-ROTATOR, ROTATOR, times.shape)
-    scatter = SEEING_BLOCK * random.standard_normal(times.shape)
+    block_scatter = SEEING_BLOCK * random.standard_normal(times.shape)
     choice = random.random(times.shape)
     sun = np.maximum(altitude(*sun_position(times), times), altitude(*sun_position(times + BLOCK), times + BLOCK))
-    light = moonlight(times + BLOCK / 2)
+    moon = moonlight(times + BLOCK / 2)
     names = list(means)
-    # wanted share of the blocks; a band that may not be used leaves them to the others
-    chances = [means[name] * np.interp(light, MOONLIGHT, BANDS[name].moonlight_choice) for name in names]
+    # relative frequencies of the bands; the blocks of a band that cannot be used go to the other bands
+    frequencies = [means[name] * np.interp(moon, MOONLIGHT, BANDS[name].moonlight_choice) for name in names]
     weight = np.stack(
-        [np.where(sun < BANDS[name].sun_limit, chance, 0) for name, chance in zip(names, chances, strict=True)]
+        [np.where(sun < BANDS[name].sun_limit, value, 0) for name, value in zip(names, frequencies, strict=True)]
     )
     total = weight.sum(axis=0)
     band = np.array([*names, ""], object)[(np.cumsum(weight, axis=0) <= choice * total).sum(axis=0)]
     used = (total > 0) & clear[:, None] & (times >= start) & (times < start + NIGHTS)
     night = np.broadcast_to(np.arange(NIGHTS)[:, None], times.shape)[used]
-    fwhm = seeing * np.exp(nightly[:, None] + scatter)
-    return Blocks(night, times[used], band[used], rotator[used], fwhm[used], dither[night])
+    fwhm = seeing * np.exp(night_scatter[:, None] + block_scatter)
+    return Blocks(
+        night=night,
+        start=times[used],
+        band=band[used],
+        rotator=rotator[used],
+        seeing=fwhm[used],
+        dither=dither[night],
+    )
 
 
 def near_fields(centre: tuple[float, float], reach: float) -> pd.DataFrame:
-    """Return the fields (number, ra, dec, cell, width, height) of the all-sky grid whose dithers may come in reach.
+    """Return the fields of the all-sky grid whose dithered positions may be near a position.
 
-    Rings of equal height, each cut in cells of equal width in right ascension: cells tile the sky exactly, so visits
-    that are spread evenly over their own cell cover the sky evenly, whatever the shape of the camera.
+    The grid consists of rings of equal height, each divided into cells of equal width in right ascension. The cells
+    tile the sky exactly, so visits that are spread evenly over their own cell cover the sky evenly, whatever the shape
+    of the camera.
+
+    Parameters
+    ----------
+    centre : tuple of float, degrees
+        Right ascension and declination of the position.
+    reach : float, degrees
+        Largest distance of a dithered visit from the position.
+
+    Returns
+    -------
+    DataFrame
+        Columns number; ra, dec (centre of the cell, degrees); cell (its area, square degrees); width (in right
+        ascension, degrees); height (degrees).
     """
     rings = round(180 / SPACING)
     height = 180 / rings
@@ -160,54 +231,75 @@ def near_fields(centre: tuple[float, float], reach: float) -> pd.DataFrame:
     fields = pd.DataFrame(
         {"number": number, "ra": ra, "dec": dec[ring], "cell": cell, "width": width, "height": height}
     )
-    # a shift in right ascension moves a field most at the side of its cell that faces the equator
-    aside = width / 2 * np.cos(np.radians(np.maximum(np.abs(dec[ring]) - height / 2, 0)))
-    near = unit_vectors(ra, dec[ring]) @ unit_vectors(*centre)
-    return fields[near >= np.cos(np.radians(np.minimum(reach + np.hypot(aside, height / 2), 180)))]
+    # a shift in right ascension is largest on the side of the cell that faces the equator
+    max_shift = width / 2 * np.cos(np.radians(np.maximum(np.abs(dec[ring]) - height / 2, 0)))
+    cos_distance = unit_vectors(ra, dec[ring]) @ unit_vectors(*centre)
+    return fields[cos_distance >= np.cos(np.radians(np.minimum(reach + np.hypot(max_shift, height / 2), 180)))]
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Blocks in which a field is visited in a band, and where in them."""
+    """The visits of a field in one band."""
 
     blocks: np.ndarray
+    """Index of the block of each visit."""
     moment: np.ndarray
-    """Share of the block that has passed."""
+    """Fraction of the block that has passed at the start of the visit."""
     sky: np.ndarray
-    """Scatter of the sky brightness, mag."""
+    """Random deviation of the sky brightness, mag."""
 
 
-def _chosen(field, band: str, candidates: np.ndarray, cells: np.ndarray, seed: int, density: float) -> _Chosen:
-    """Draw the visits of a field among its candidate blocks.
+def _choose(
+    field: _Field, band: str, candidates: np.ndarray, curve_positions: np.ndarray, seed: int, density: float
+) -> _Chosen:
+    """Draw the visits of a field in one band.
 
     Parameters
     ----------
-    cells : of all blocks, the place of their dither on a curve that fills the cell of the field grid
-    density : visits a square degree
+    field : _Field
+        The field.
+    band : str
+        The band.
+    candidates : ndarray of int
+        Indices of the blocks of the band in which the field can be observed.
+    curve_positions : ndarray, shape (blocks,)
+        Position of the dither of each block on a curve that fills the cell of the field grid.
+    seed : int
+        Seed of the survey.
+    density : float
+        Mean number of visits per square degree.
     """
     random = rng(seed, "pointings", "rubin", field.number, band)
     expected = density * field.cell
     count = (int(expected) + (random.random() < expected % 1)) * (len(candidates) > 0)
-    # every so-many-th block in the order of their dithers: all are as likely, but the visits of a field cover its
-    # surroundings evenly, as a scheduler sees to; twice in a block only where there are fewer blocks than visits
-    order = np.lexsort((random.random(len(candidates)), cells[candidates]))
+    # systematic sampling of the blocks in the order of their dithers: all blocks are equally likely, and the visits
+    # cover the cell of the field evenly, as a scheduler would make them; a block is used twice only if there are fewer
+    # blocks than visits
+    order = np.lexsort((random.random(len(candidates)), curve_positions[candidates]))
     rank = (random.random() + np.arange(count)) * len(candidates) / max(count, 1)
     blocks = candidates[order[rank.astype(int)]]
     return _Chosen(blocks, random.random(count), SKY_SCATTER * random.standard_normal(count))
 
 
-def _along_curve(dither: np.ndarray) -> np.ndarray:
-    """Return the place (n,) of dithers (n, 2) on Morton's curve through 16 x 16 squares: near ones are near on it."""
+def _morton_position(dither: np.ndarray) -> np.ndarray:
+    """Return the positions (n,) of dithers (n, 2) on the Morton curve through 16 x 16 squares of a cell.
+
+    Dithers that are near on the curve are near on the sky.
+    """
     squares = np.minimum(((dither + 0.5) * 16).astype(int), 15)
-    return sum((squares[:, axis] >> bit & 1) << 2 * bit + axis for bit in range(4) for axis in range(2))
+    position = np.zeros(len(squares), int)
+    for bit in range(4):
+        for axis in range(2):
+            position += (squares[:, axis] >> bit & 1) << 2 * bit + axis
+    return position
 
 
-def _visits(field, band: str, blocks: Blocks, chosen: _Chosen) -> pd.DataFrame:
-    """Return the visits of a field in a band."""
+def _visits(field: _Field, band: str, blocks: Blocks, chosen: _Chosen) -> pd.DataFrame:
+    """Return the table of the visits of a field in one band."""
     at = chosen.blocks
     mjd = blocks.start[at] + BLOCK * chosen.moment
-    along, up = blocks.dither[at].T
-    ra, dec = (field.ra + along * field.width) % 360, field.dec + up * field.height
+    ra_shift, dec_shift = blocks.dither[at].T
+    ra, dec = (field.ra + ra_shift * field.width) % 360, field.dec + dec_shift * field.height
     return pd.DataFrame(
         {
             "visit": (field.number * 6 + "ugrizy".index(band)) * 10_000 + np.arange(len(at)),
@@ -224,17 +316,27 @@ def _visits(field, band: str, blocks: Blocks, chosen: _Chosen) -> pd.DataFrame:
     )
 
 
-def _observable(field, times: list[np.ndarray], moon: list[tuple]) -> np.ndarray:
-    """True for blocks, given by start and end, in which a field is high and far from the Moon throughout."""
+def _observable(field: _Field, times: list[np.ndarray], moon: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return a mask of the blocks in which a field can be observed: high, and far from the Moon.
+
+    Parameters
+    ----------
+    field : _Field
+        The field.
+    times : list of ndarray, shape (blocks,), MJD
+        Start and end of the blocks.
+    moon : list of (ndarray, ndarray), degrees
+        Right ascension and declination of the Moon at these times.
+    """
     transit = 90 - abs(field.dec - LATITUDE)
-    # a field that only just rises above the limit, or never does, is observed near its transit
+    # a field that transits near the limit or below it is observed within 5 degrees of the altitude of its transit
     lowest = min(np.degrees(np.arcsin(1 / AIRMASS)), transit - 5)
-    fit = np.full(len(times[0]), transit >= LOWEST_TRANSIT)
+    observable = np.full(len(times[0]), transit >= LOWEST_TRANSIT)
     for mjd, (moon_ra, moon_dec) in zip(times, moon, strict=True):
-        apart = unit_vectors(moon_ra, moon_dec) @ unit_vectors(field.ra, field.dec)
-        close = (apart > np.cos(np.radians(MOON_DISTANCE))) & (altitude(moon_ra, moon_dec, mjd) > 0)
-        fit &= (altitude(field.ra, field.dec, mjd) >= lowest) & ~close
-    return fit
+        cos_distance = unit_vectors(moon_ra, moon_dec) @ unit_vectors(field.ra, field.dec)
+        close = (cos_distance > np.cos(np.radians(MOON_DISTANCE))) & (altitude(moon_ra, moon_dec, mjd) > 0)
+        observable &= (altitude(field.ra, field.dec, mjd) >= lowest) & ~close
+    return observable
 
 
 def _edge(region: Region) -> np.ndarray:
@@ -244,90 +346,3 @@ def _edge(region: Region) -> np.ndarray:
     height = region.dec_min + (region.dec_max - region.dec_min) * along
     dec = np.concatenate([0 * along + region.dec_min, 0 * along + region.dec_max, height, height])
     return unit_vectors(ra, dec)
-
-
-def hour_angle(ra, mjd) -> np.ndarray:
-    """Return the hour angle, degrees, at Cerro Pachon; mean sidereal time (Meeus 1998, equation 12.4), UT1 = UTC."""
-    return (280.46061837 + 360.98564736629 * (np.asarray(mjd) - 51544.5) + LONGITUDE - ra + 180) % 360 - 180
-
-
-def altitude(ra, dec, mjd) -> np.ndarray:
-    """Return the altitude, degrees, at Cerro Pachon, without refraction."""
-    hour, dec, latitude = np.radians(hour_angle(ra, mjd)), np.radians(dec), np.radians(LATITUDE)
-    return np.degrees(np.arcsin(np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)))
-
-
-def parallactic_angle(ra, dec, mjd) -> np.ndarray:
-    """Return the position angle of the zenith, degrees east of north."""
-    hour, dec, latitude = np.radians(hour_angle(ra, mjd)), np.radians(dec), np.radians(LATITUDE)
-    north = np.tan(latitude) * np.cos(dec) - np.sin(dec) * np.cos(hour)
-    return np.degrees(np.arctan2(np.sin(hour), north))
-
-
-def sun_position(mjd) -> tuple[np.ndarray, np.ndarray]:
-    """Return right ascension and declination of the Sun, degrees, to 0.01 (Astronomical Almanac, page C5)."""
-    days = np.asarray(mjd) - 51544.5
-    anomaly = np.radians(357.528 + 0.9856003 * days)
-    longitude = 280.460 + 0.9856474 * days + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly)
-    return _equatorial(longitude, np.zeros_like(longitude), days)
-
-
-def moon_position(mjd) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Moon's geocentric right ascension and declination, degrees, to 0.3 (Astronomical Almanac, D46)."""
-    days = np.asarray(mjd) - 51544.5
-    t = days / 36525
-
-    def wave(phase: float, rate: float) -> np.ndarray:
-        return np.sin(np.radians(phase + rate * t))
-
-    longitude = 218.32 + 481267.881 * t + 6.29 * wave(135.0, 477198.87) - 1.27 * wave(259.3, -413335.36)
-    longitude += 0.66 * wave(235.7, 890534.22) + 0.21 * wave(269.9, 954397.74)
-    longitude -= 0.19 * wave(357.5, 35999.05) + 0.11 * wave(186.5, 966404.03)
-    latitude = 5.13 * wave(93.3, 483202.02) + 0.28 * wave(228.2, 960400.89)
-    latitude -= 0.28 * wave(318.3, 6003.15) + 0.17 * wave(217.6, -407332.21)
-    return _equatorial(longitude, latitude, days)
-
-
-def _equatorial(longitude, latitude, days) -> tuple[np.ndarray, np.ndarray]:
-    obliquity = np.radians(23.439 - 4e-7 * days)
-    x, y, z = np.moveaxis(unit_vectors(longitude, latitude), -1, 0)
-    y, z = np.cos(obliquity) * y - np.sin(obliquity) * z, np.sin(obliquity) * y + np.cos(obliquity) * z
-    return np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(z))
-
-
-def moon_phase(mjd) -> np.ndarray:
-    """Return the phase angle of the Moon, degrees: 0 when full, 180 when new."""
-    apart = np.sum(unit_vectors(*moon_position(mjd)) * unit_vectors(*sun_position(mjd)), axis=-1)
-    return 180 - np.degrees(np.arccos(np.clip(apart, -1, 1)))
-
-
-def moonlight(mjd) -> np.ndarray:
-    """Return how moonlit the sky is, 0 to 1: the illuminated fraction times the sine of the Moon's altitude."""
-    up = np.sin(np.radians(np.maximum(altitude(*moon_position(mjd), mjd), 0)))
-    return (1 + np.cos(np.radians(moon_phase(mjd)))) / 2 * up
-
-
-def sky_brightness(band: str, ra, dec, mjd) -> np.ndarray:
-    """Return the sky at positions and times, AB mag / arcsec2: airglow, scattered moonlight and twilight.
-
-    Airglow (`RubinBand.airglow` at zenith) and moonlight follow Krisciunas & Schaefer (1991). Their V is carried to a
-    band with the Sun's colour and wavelength^-2, between Rayleigh's and Mie's scattering; twilight is V 22.3 at -15
-    degrees, one magnitude a degree (Patat et al. 2006), with the Sun's colour. Both are fitted to visits of an OpSim
-    baseline 3.
-    """
-    zenith = 90 - altitude(ra, dec, mjd)
-    path = 1 / np.sqrt(1 - 0.96 * np.sin(np.radians(zenith)) ** 2)
-    dark = 10 ** (-0.4 * (BANDS[band].airglow + BANDS[band].extinction * (path - 1))) * path
-    colour = BANDS[band].sun - SUN_V
-    moon_ra, moon_dec = moon_position(mjd)
-    moon_high = altitude(moon_ra, moon_dec, mjd)
-    moon_path = 1 / np.sqrt(1 - 0.96 * np.cos(np.radians(np.maximum(moon_high, 0))) ** 2)
-    phase = moon_phase(mjd)
-    apart = np.degrees(np.arccos(np.sum(unit_vectors(moon_ra, moon_dec) * unit_vectors(ra, dec), axis=-1)))
-    scattered = 10**5.36 * (1.06 + np.cos(np.radians(apart)) ** 2) + 10 ** (6.15 - apart / 40)
-    scattered *= (BANDS[band].effective_wave / 550) ** -2 * (1 - 10 ** (-0.4 * EXTINCTION_V * path))
-    moon = 3.84 + 0.026 * phase + 4e-9 * phase**4 + BANDS[band].extinction * moon_path
-    # nanolamberts; 34.08 are V 22.5 mag / arcsec2
-    lit = np.where(moon_high > 0, scattered * 10 ** (-0.4 * moon), 0) / 34.08 * 10 ** (-0.4 * (22.5 + colour))
-    twilight = 10 ** (-0.4 * (22.3 - (altitude(*sun_position(mjd), mjd) + 15) + colour))
-    return -2.5 * np.log10(dark + lit + twilight)

@@ -57,7 +57,13 @@ class Means:
         """True where an exposure was left out because of a bad pixel that is also marked, (ny, nx)."""
 
     def add(
-        self, planes: np.ndarray, bad: np.ndarray, marked: np.ndarray, weight: float, onto: PixelMap, corner: tuple
+        self,
+        planes: np.ndarray,
+        bad: np.ndarray,
+        marked: np.ndarray,
+        weight: float,
+        onto: PixelMap,
+        corner: tuple[int, int],
     ) -> int:
         """Add a part of an exposure.
 
@@ -101,7 +107,8 @@ class Means:
                 bad,
                 marked,
                 np.float32(weight),
-                *corner,
+                corner[0],
+                corner[1],
                 _WEIGHTS,
             )
         return covered

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 
 from romandask.kernels.coadding.pixel_map import PixelMap
@@ -68,7 +69,7 @@ def _padded(image: np.ndarray, n: int) -> np.ndarray:
 def blurred(
     read: Callable[[slice, slice], np.ndarray], shape: tuple[int, int], kernel: np.ndarray, onto: PixelMap, area: float
 ) -> np.ndarray:
-    """Convolve a sharp image with a kernel and interpolate it part_positions some pixels of a target image.
+    """Convolve a sharp image with a kernel and interpolate it at some pixels of a target image.
 
     Parameters
     ----------
@@ -145,12 +146,12 @@ def surface(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return (up @ matrix).astype(np.float32) @ across.T.astype(np.float32)
 
 
-def polynomials(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def polynomials(y: ArrayLike, x: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
     """Return the terms of a polynomial in position, with coordinates that run from -1 to 1 over an image.
 
     Parameters
     ----------
-    y, x : ndarray, shape (...), pixels
+    y, x : array-like, shape (...), pixels
     shape : tuple of int
         Rows and columns of the image.
 
@@ -213,8 +214,8 @@ def match(image: np.ndarray, template: np.ndarray, error: np.ndarray, x: np.ndar
     """
     kernels = basis_kernels()
     basis = [convolved(template, kernel) for kernel in kernels]
-    stamps = [_stamp(image, basis, error, int(round(v)), int(round(u))) for u, v in zip(x, y, strict=True)]
-    stamps = [stamp for stamp in stamps if stamp is not None]
+    candidates = (_stamp(image, basis, error, int(round(v)), int(round(u))) for u, v in zip(x, y, strict=True))
+    stamps = [stamp for stamp in candidates if stamp is not None]
     terms = len(polynomials(0, 0, image.shape))
     if not stamps:
         coefficients = np.zeros((len(kernels), terms))

@@ -274,10 +274,9 @@ def _draw(
         objects, n_modes = chosen[part], int(object_modes[part].max())
         begin = np.concatenate([[0], np.cumsum(count[part])])
         components = np.repeat(first[objects] - begin[:-1], count[part]) + np.arange(begin[-1])
-        psfs = [
-            np.ascontiguousarray(weights[components, :n_modes]) @ plane[:n_modes]
-            for plane in (frequencies.real, frequencies.imaginary)
-        ]
+        part_weights = np.ascontiguousarray(weights[components, :n_modes])
+        psf_real = part_weights @ frequencies.real[:n_modes]
+        psf_imaginary = part_weights @ frequencies.imaginary[:n_modes]
         transforms = np.empty((len(objects), stamp, stamp // 2 + 1), np.complex64)
         fill_transforms(
             transforms,
@@ -291,7 +290,8 @@ def _draw(
             scene.smoothing,
             scene.knots,
             begin,
-            *psfs,
+            psf_real,
+            psf_imaginary,
             frequencies.starts,
             frequencies.x,
             frequencies.y,

@@ -48,7 +48,7 @@ def draw_objects(
     cells = [psfs(x, y)[0] if size else None for x, y, size in zip(scene.x, scene.y, stamps.size, strict=True)]
     first = np.searchsorted(scene.owner, np.arange(len(scene.x) + 1))
     # sorted by cell, because the PSFs of a cell are expensive
-    for n in sorted(np.flatnonzero(stamps.size), key=lambda n: (cells[n], n)):
+    for n in sorted(np.flatnonzero(stamps.size).tolist(), key=lambda n: (cells[n], n)):
         _, nodes = psfs(scene.x[n], scene.y[n])
         profile = object_profile(scene, n, first, [psf.dilate(1 / pixel_scale) for psf in nodes])
         size = int(stamps.size[n])

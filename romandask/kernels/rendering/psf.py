@@ -295,7 +295,8 @@ def place_weights(x: np.ndarray, y: np.ndarray, shape: tuple[int, int], degree: 
     degree : int
         Total degree of the polynomials.
     """
-    at_nodes = _polynomials(*place_grid(shape, degree).T, shape, degree)
+    node_x, node_y = place_grid(shape, degree).T
+    at_nodes = _polynomials(node_x, node_y, shape, degree)
     return _polynomials(np.asarray(x, float), np.asarray(y, float), shape, degree) @ np.linalg.inv(at_nodes)
 
 

@@ -89,7 +89,7 @@ def galaxy_rows(
     bulge_ratio = (1 - 0.6 * ellipticity) / (1 + 0.6 * ellipticity)
     mw_av = np.full(n, milky_way_av)
     r_band = table.band_index(REFERENCE_BAND)
-    magnorm, photons = {}, 0.0
+    magnorm, photons_of = {}, {}
     for name, sed, av, fraction in (
         ("bulge", bulge_sed, bulge_av, bulge_fraction),
         ("disk", disk_sed, disk_av, 1 - bulge_fraction),
@@ -98,7 +98,8 @@ def galaxy_rows(
         r_flux = njy(at_magnorm_0[ALL_DUST, :, r_band], table.bandpasses[r_band])
         with np.errstate(divide="ignore"):
             magnorm[name] = mag - 2.5 * np.log10(fraction) + 2.5 * np.log10(r_flux / NJY_ZERO_POINT)
-        photons = photons + at_magnorm_0 * 10 ** (-0.4 * magnorm[name])[None, :, None]
+        photons_of[name] = at_magnorm_0 * 10 ** (-0.4 * magnorm[name])[None, :, None]
+    photons = photons_of["bulge"] + photons_of["disk"]
     i_band = table.band_index("i")
     i_mag = 31.4 - 2.5 * np.log10(njy(photons[ALL_DUST, :, i_band], table.bandpasses[i_band]))
     has_knots = (i_mag <= KNOTS_LIMIT) & ~early & (uniform[HAS_KNOTS] < np.clip(radius / 0.6, 0, 0.7))

@@ -222,8 +222,10 @@ def structure(nside: int, pixels: np.ndarray, seed: int, cosmology: Cosmology = 
         fields["delta"][shell] = delta[ring]
         fields["galaxies"][shell] = _relative_density(delta, float(bias(window.zeff, cosmology)), ring)
         lens.add_window(delta, window)
-        fields["convergence"][shell] = lens.kappa[ring]
-        fields["shear_1"][shell], fields["shear_2"][shell] = _shear(lens.kappa, nside, lmax, ring)
+        # None only before the first window
+        convergence = np.asarray(lens.kappa)
+        fields["convergence"][shell] = convergence[ring]
+        fields["shear_1"][shell], fields["shear_2"][shell] = _shear(convergence, nside, lmax, ring)
     return Structure(nside, pixels, all_shells.edges, all_shells.planes, fields)
 
 

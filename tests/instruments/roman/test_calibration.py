@@ -1,4 +1,4 @@
-"""Calibration files: the layout of the paper's table 1, statistics of what is made up, and clear words on bad ones."""
+"""Calibration files: the layout of Troxel et al. (2023), table 1, statistics of synthetic SCAs, and error messages."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def made(tmp_path_factory):
     path.unlink()
 
 
-def test_extensions_are_those_of_table_1_in_their_order(made):
+def test_files_have_the_extensions_of_table_1_in_order(made):
     check(made)
     assert check_files(made.parent) == [made]
     with fits.open(made) as file:
@@ -56,19 +56,19 @@ def test_extensions_are_those_of_table_1_in_their_order(made):
     assert not list(made.parent.glob(".*partial"))
 
 
-def test_values_are_the_generators_whatever_else_is_made(made):
-    def of(name):
+def test_values_depend_only_on_the_seed_and_the_sca(made):
+    def generator(name):
         return rng(7, "calibration", 3, name)
 
-    np.testing.assert_array_equal(read(made, "GAIN"), sca.gain(of))
-    np.testing.assert_array_equal(read(made, "BIAS"), sca.bias(of))
+    np.testing.assert_array_equal(read(made, "GAIN"), sca.gain(generator))
+    np.testing.assert_array_equal(read(made, "BIAS"), sca.bias(generator))
     bits = read(made, "BADPIX")
-    np.testing.assert_array_equal(bits, sca.bad_pixels(of))
-    np.testing.assert_array_equal(read(made, "DARK"), sca.dark_current(of, bits))
-    assert (sca.gain(of) != sca.gain(lambda name: rng(7, "calibration", 4, name))).all()
+    np.testing.assert_array_equal(bits, sca.bad_pixels(generator))
+    np.testing.assert_array_equal(read(made, "DARK"), sca.dark_current(generator, bits))
+    assert (sca.gain(generator) != sca.gain(lambda name: rng(7, "calibration", 4, name))).all()
 
 
-def test_made_up_detectors_have_the_statistics_of_real_ones(made):
+def test_synthetic_detectors_have_the_statistics_of_real_ones(made):
     gain, well, bias = read(made, "GAIN"), read(made, "SATURATE"), read(made, "BIAS").astype(float)
     assert gain.mean() == pytest.approx(1.6, rel=0.02)
     assert well.mean() == pytest.approx(1.1e5, rel=1e-3)
@@ -91,12 +91,12 @@ def test_made_up_detectors_have_the_statistics_of_real_ones(made):
     persistence = read(made, "PERSIST")[:, 100:200, 100:200]
     assert (np.diff(persistence, axis=0) > 0).all()
     assert len(persistence) == len(STIMULI)
-    # at full well the signal still grows with the charge
+    # the signal increases with the charge up to the full well
     b = read(made, "CNL")
     assert (1 - 1.2e5 * (2 * b[0] + 1.2e5 * (3 * b[1] + 4 * 1.2e5 * b[2])) > 0.5).all()
 
 
-def test_bad_pixels_have_footprints_and_what_makes_them_bad(made):
+def test_bad_pixels_have_neighbours_and_the_properties_of_their_bits(made):
     bits = read(made, "BADPIX")
     inner = bits[4:-4, 4:-4]
     for bit, share in ((DISCONNECTED, 3e-4), (HOT, 1e-3), (LOW_EFFICIENCY, 8e-4), (NOISY, 2e-3)):
@@ -104,8 +104,8 @@ def test_bad_pixels_have_footprints_and_what_makes_them_bad(made):
     y, x = np.nonzero(bits & HOT)
     assert (bits[y, np.minimum(x + 1, 4095)] & (ADJACENT | REFERENCE) > 0).all()
     assert (read(made, "DARK")[y, x] >= 1).all()
-    weak = bits & LOW_EFFICIENCY > 0
-    assert (read(made, "RELQE1")[weak] <= 0.8).all()
+    low_efficiency = bits & LOW_EFFICIENCY > 0
+    assert (read(made, "RELQE1")[low_efficiency] <= 0.8).all()
     border = np.ones(bits.shape, bool)
     border[4:-4, 4:-4] = False
     assert (bits[border] & REFERENCE > 0).all()
@@ -113,37 +113,37 @@ def test_bad_pixels_have_footprints_and_what_makes_them_bad(made):
     assert sum(BAD_BITS.values()) == 63
 
 
-def test_flat_kernels_lie_block_beside_block(made):
+def test_flat_extensions_hold_kernels_side_by_side(made):
     kernels = read(made, "BFE")
     side_by_side = read(made, "BFEFLAT")
     np.testing.assert_array_equal(side_by_side[5 * 3 : 5 * 4, 5 * 8 : 5 * 9], kernels[:, :, 3, 8])
     np.testing.assert_array_equal(read(made, "IPCFLAT"), flat(read(made, "IPC")))
 
 
-def test_a_damaged_value_is_found(made):
+def test_a_damaged_value_is_detected(made):
     with fits.open(made) as file:
-        place = file["GAIN"].fileinfo()["datLoc"] + 77
+        offset = file["GAIN"].fileinfo()["datLoc"] + 77
     with open(made, "r+b") as raw:
-        raw.seek(place)
+        raw.seek(offset)
         byte = raw.read(1)
-        raw.seek(place)
+        raw.seek(offset)
         raw.write(bytes([byte[0] ^ 4]))
     try:
         with pytest.raises(UserError, match="GAIN is damaged"):
             read(made, "GAIN")
     finally:
         with open(made, "r+b") as raw:
-            raw.seek(place)
+            raw.seek(offset)
             raw.write(byte)
     read(made, "GAIN")
 
 
 @pytest.fixture(scope="module")
 def planes(made):
-    """The calibrations in memory, as `expose` asks for them."""
-    kinds = {"CNL": np.float32, "READ": np.float32}
+    """The calibrations in memory, as a `Planes` function."""
+    dtypes = {"CNL": np.float32, "READ": np.float32}
     names = [extension.name for extension in TABLE if extension.dtype and not extension.name.endswith("FLAT")]
-    values = {name: read(made, name).astype(kinds.get(name, calibration_files.BY_NAME[name].dtype)) for name in names}
+    values = {name: read(made, name).astype(dtypes.get(name, calibration_files.BY_NAME[name].dtype)) for name in names}
 
     def get(name, rows):
         return values[name] if name in ("BFE", "IPC", "GAIN") else values[name][..., rows, :]
@@ -154,12 +154,13 @@ def planes(made):
 
 @pytest.fixture(scope="module")
 def response():
-    """That of a band in which nothing depends on the wavelength."""
+    """Response in a band where efficiency and yield are 1."""
     return Response(np.ones((64, 64), np.float32), np.ones((32, 32), np.float32), 139.8)
 
 
-def expose(light, planes, response, generators, late=None):
-    return read_out(accumulate(light, planes, response, generators), planes, response, generators, late)
+def expose(light, planes, response, generators, persistence=None):
+    """Return data numbers and dq of an exposure."""
+    return read_out(accumulate(light, planes, response, generators), planes, response, generators, persistence)
 
 
 def generators(name, block):
@@ -173,20 +174,20 @@ def test_a_dark_exposure_has_the_moments_of_its_calibrations(planes, response):
     signal = (numbers.astype(float) - planes("BIAS", slice(0, 4096))[inner]) * gain
     good = dq == 0
     dark, read_noise = planes("DARK", slice(0, 4096))[inner] * 139.8, planes("READ", slice(0, 4096))[inner]
-    # a little of the hot pixels' charge appears in those at their corners
+    # interpixel capacitance moves a little charge of hot pixels to their unflagged diagonal neighbours
     assert signal[good].mean() == pytest.approx(dark[good].mean(), abs=0.05)
     variance = dark[good].mean() * 0.887 + np.mean(read_noise[good] ** 2) + np.mean(gain[good] ** 2) / 12
     # interpixel capacitance averages the noise of the dark current over neighbours: 0.94^2 + 4 * 0.0135^2 + ...
     assert signal[good].var() == pytest.approx(variance + dark[good].var() * 0.89, rel=5e-3)
     hot = dq & HOT_FLAG > 0
     assert np.median(signal[hot]) == pytest.approx(np.median(0.94 * np.minimum(dark[hot], 1.1e5)), rel=0.1)
-    dead = dq & DISCONNECTED_FLAG > 0
-    assert signal[dead].mean() == pytest.approx(0, abs=1)
+    disconnected = dq & DISCONNECTED_FLAG > 0
+    assert signal[disconnected].mean() == pytest.approx(0, abs=1)
     again, _ = expose(np.zeros((4088, 4088), np.float32), planes, response, generators)
     np.testing.assert_array_equal(again, numbers)
 
 
-def test_a_flat_is_found_again_with_its_variance(planes, response):
+def test_calibration_recovers_a_flat_and_its_variance(planes, response):
     light = np.full((4088, 4088), 185.0, np.float32)
     numbers, dq = expose(light, planes, response, generators)
     image, variance = calibrate(numbers, planes, response)
@@ -194,20 +195,20 @@ def test_a_flat_is_found_again_with_its_variance(planes, response):
     assert good.mean() > 0.985
     assert image[good].mean() == pytest.approx(185, rel=1e-3)
     assert ((image[good] - 185) / np.sqrt(variance[good])).std() == pytest.approx(1, abs=0.015)
-    # what earlier exposures left comes on top, and is flagged
-    glow = np.zeros((4088, 4088), np.float32)
-    glow[1000:1100, 500:600] = 2.0
-    late, flags = expose(light, planes, response, generators, glow)
-    place = (slice(1000, 1100), slice(500, 600))
-    assert (flags[place] & PERSISTENCE > 0).all()
+    # persistence is added to the image and flagged
+    persistence = np.zeros((4088, 4088), np.float32)
+    persistence[1000:1100, 500:600] = 2.0
+    numbers, flags = expose(light, planes, response, generators, persistence)
+    square = (slice(1000, 1100), slice(500, 600))
+    assert (flags[square] & PERSISTENCE > 0).all()
     assert (flags & PERSISTENCE > 0).sum() == 10_000
-    change = calibrate(late, planes, response)[0][place] - image[place]
-    # fewer or more electrons are caught by weak pixels alone: take the others
+    change = calibrate(numbers, planes, response)[0][square] - image[square]
+    # the median excludes pixels of low efficiency
     assert np.median(change) == pytest.approx(2 * 139.8, rel=0.02)
 
 
-def test_stars_have_the_flux_that_the_simple_detector_gives_them(planes, response):
-    """Over 17 to 22 mag, in apertures that hold what the brighter-fatter effect moves, to 0.3%."""
+def test_fluxes_of_stars_agree_with_the_simple_detector(planes, response):
+    """From 17 to 22 mag, to 0.3%, in apertures that contain the charge moved by the brighter-fatter effect."""
     side, sky = 32, 100.0
     y, x = np.indices((side, side)) - 15.6
     spot = np.exp(-(x**2 + y**2) / (2 * 1.3**2))
@@ -224,19 +225,21 @@ def test_stars_have_the_flux_that_the_simple_detector_gives_them(planes, respons
     bad = dq.astype(bool)[: n * side, : n * side].reshape(n, side, n, side).transpose(0, 2, 1, 3)[..., 6:26, 6:26]
     clean = ~bad.any(axis=(2, 3))
 
-    def measured(array):
+    def aperture_flux(array):
         cut = array[: n * side, : n * side].reshape(n, side, n, side).transpose(0, 2, 1, 3)
         return (cut[..., 6:26, 6:26] - np.float32(sky)).sum(axis=(2, 3), dtype=float)
 
-    ours, theirs = measured(image), measured(simple)
+    full_model, simple_model = aperture_flux(image), aperture_flux(simple)
     for k, flux in enumerate(fluxes):
-        own = clean & (level == k)
-        assert own.sum() > 50, k
-        scatter = theirs[own].std() / np.sqrt(own.sum()) / flux
-        assert ours[own].mean() / theirs[own].mean() == pytest.approx(1, abs=max(0.003, 4 * scatter)), k
+        chosen = clean & (level == k)
+        assert chosen.sum() > 50, k
+        scatter = simple_model[chosen].std() / np.sqrt(chosen.sum()) / flux
+        assert full_model[chosen].mean() / simple_model[chosen].mean() == pytest.approx(
+            1, abs=max(0.003, 4 * scatter)
+        ), k
 
 
-def test_poisson_numbers_of_small_means_are_poissons():
+def test_poisson_numbers_have_the_poisson_distribution():
     mean = np.repeat(np.array([0.0, 0.3, 2.1, 15.0, 400.0], np.float32), 200_000).reshape(5, -1)
     numbers = poisson(mean, rng(1, "poisson"))
     assert (numbers[0] == 0).all()
@@ -247,21 +250,21 @@ def test_poisson_numbers_of_small_means_are_poissons():
     np.testing.assert_allclose(share, stats.poisson.pmf(np.arange(8), 2.1), atol=5e-3)
 
 
-def test_bad_files_are_said_in_one_line(tmp_path):
+def test_errors_of_bad_files(tmp_path):
     path = path_of(tmp_path, 1)
     with pytest.raises(UserError, match=r"no calibration file \(sca01.fits to sca18.fits\)"):
         check_files(tmp_path)
     path.write_text("not FITS")
     with pytest.raises(UserError, match="sca01.fits: not a FITS file"):
         check(path)
-    every = [fits.ImageHDU(name=extension.name) for extension in TABLE]
-    fits.HDUList([fits.PrimaryHDU(), *every[:-1]]).writeto(path, overwrite=True)
+    hdus = [fits.ImageHDU(name=extension.name) for extension in TABLE]
+    fits.HDUList([fits.PrimaryHDU(), *hdus[:-1]]).writeto(path, overwrite=True)
     with pytest.raises(UserError, match="extensions BIAS are missing"):
         check(path)
-    fits.HDUList([fits.PrimaryHDU(), *every]).writeto(path, overwrite=True)
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path, overwrite=True)
     with pytest.raises(UserError, match=r"RELQE1 has shape \(\), expected \(4096, 4096\)"):
         check(path)
-    fits.HDUList([fits.PrimaryHDU(), every[1], every[0], *every[2:]]).writeto(path, overwrite=True)
+    fits.HDUList([fits.PrimaryHDU(), hdus[1], hdus[0], *hdus[2:]]).writeto(path, overwrite=True)
     with pytest.raises(UserError, match="extensions are RELQE1, SOURCES"):
         check(path)
     hdu = fits.ImageHDU(np.zeros((32, 32)), name="GAIN")
@@ -276,7 +279,7 @@ def test_bad_files_are_said_in_one_line(tmp_path):
         read(path, "DARK")
 
 
-def test_the_generator_refuses_before_it_writes(tmp_path, monkeypatch):
+def test_make_files_checks_its_arguments_before_it_writes(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="SCA 19: Roman has 1 to 18"):
         list(make_files(tmp_path / "out", 1, [1, 19]))
     monkeypatch.setattr("romandask.instruments.roman.calibration.BYTES", 1 << 60)
@@ -286,7 +289,7 @@ def test_the_generator_refuses_before_it_writes(tmp_path, monkeypatch):
     assert calibration_files.BY_NAME["CNL"].shape == (3, 4096, 4096)
 
 
-def test_the_command_line_says_what_is_wrong(tmp_path):
+def test_errors_of_the_commands(tmp_path):
     done = command("calibration", "check", str(tmp_path))
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: ")

@@ -1,4 +1,4 @@
-"""Exposures with the full model of the SCAs: persistence in order of time, resume, and what users may do wrong."""
+"""Exposures with the full detector model of the SCAs: persistence, resumed runs and user errors."""
 
 import io
 from dataclasses import replace
@@ -38,7 +38,7 @@ FULL = (
 )
 
 
-def test_what_came_before_is_of_the_same_sca_and_not_long_ago():
+def test_earlier_exposures_are_of_the_same_sca_and_recent():
     random = rng(1, "before")
     start = random.uniform(0, 4000, 60)
     table = pd.DataFrame(
@@ -58,18 +58,17 @@ def test_what_came_before_is_of_the_same_sca_and_not_long_ago():
         found = before(table, k).tolist()
         assert sorted(found) == expected
         assert (np.diff(start[found]) > 0).all()
-    assert age(Exposure(1, 1, "H158", 0.0, 140.0, 0, 0, 0), Exposure(2, 1, "H158", 200 / DAY, 140.0, 0, 0, 0)) == (
-        pytest.approx(200 - 140 + 70)
-    )
+    first = Exposure(visit=1, detector=1, band="H158", mjd=0.0, exptime=140.0, ra=0, dec=0, pa=0)
+    assert age(first, replace(first, visit=2, mjd=200 / DAY)) == pytest.approx(200 - 140 + 70)
 
 
-def test_traps_hold_the_formula_of_bright_pixels_alone():
+def test_traps_hold_interpolated_charge_of_bright_pixels_only():
     planes = {
         "PERSIST": released_charge(lambda name: rng(3, name)),
         "SATURATE": np.full((4096, 4096), 110_000, np.int32),
     }
     charge = np.zeros((4096, 4096), np.float32)
-    # at levels, between them, beyond the well; on reference pixels; too faint
+    # at tabulated levels, between levels and above the full well; on reference pixels; too faint
     charge[100, 200:204], charge[2, 9], charge[4091, 4091] = [1e4, 2e4, 3e4, 4e5], 5e4, 8e4
     charge[300, 300] = 600.0
     found = trap(charge, lambda name, rows: planes[name][..., rows, :])
@@ -78,7 +77,7 @@ def test_traps_hold_the_formula_of_bright_pixels_alone():
     at = planes["PERSIST"][:, 100, 200:204]
     expected = [at[2, 0], (at[2, 1] + at[3, 1]) / 2, at[3, 2]]
     np.testing.assert_allclose(found.charge[:3], expected, rtol=1e-5)
-    # clipped at the well: between 1e5 and 3e5
+    # clipped at the full well, between 1e5 and 3e5
     np.testing.assert_allclose(found.charge[3], at[4, 3] + 0.05 * (at[5, 3] - at[4, 3]), rtol=1e-5)
     assert (found.charge >= MIN_TRAPPED_CHARGE).all()
     twice = Trapped(np.array([0, 4088], np.int32), np.array([3.0, 5.0], np.float32))
@@ -89,29 +88,29 @@ def test_traps_hold_the_formula_of_bright_pixels_alone():
     assert afterglow([]) is None
 
 
-def test_tasks_follow_those_they_come_after():
+def test_tasks_run_after_their_prerequisites():
     tasks = [
         Task(0, "", 1.0, "b"),
         Task(1, "", 9.0, "a", (3,)),
         Task(2, "", 5.0, "a", (1,)),
         Task(3, "", 1.0, "c", (0,)),
     ]
-    waiting = TaskQueue(tasks)
+    queue = TaskQueue(tasks)
     order = []
-    while waiting:
-        order.append(waiting.next().index)
+    while queue:
+        order.append(queue.next().index)
     assert order == [0, 3, 1, 2]
-    waiting = TaskQueue(tasks)
-    waiting.next()
-    assert [task.index for task in waiting.give_up(0)] == [3, 1, 2]
-    assert not waiting
-    waiting.again(tasks[0])
-    assert waiting.next() == tasks[0]
+    queue = TaskQueue(tasks)
+    queue.next()
+    assert [task.index for task in queue.give_up(0)] == [3, 1, 2]
+    assert not queue
+    queue.again(tasks[0])
+    assert queue.next() == tasks[0]
 
 
 @pytest.fixture(scope="module")
 def full_store(tmp_path_factory):
-    """A small survey with the full model of the SCAs."""
+    """Store of a small survey with the full detector model."""
     folder = tmp_path_factory.mktemp("full")
     done = command("run", "tiny", *FULL, "--store", "full", cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -120,14 +119,14 @@ def full_store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def later(full_store):
-    """The survey and an exposure that follows another of its SCA."""
+    """The survey, the row of an exposure with persistence, and the row of the earlier exposure that causes it."""
     survey = open_survey(full_store)
     table = survey.pointings("roman")
     (row,) = [k for k in range(len(table)) if len(before(table, k))]
     return survey, row, int(before(table, row)[0])
 
 
-def test_exposures_have_what_was_read_and_its_calibration(later):
+def test_exposures_have_raw_data_and_calibrated_images(later):
     survey, row, _ = later
     data = survey.exposures("roman")
     assert data["raw"].attrs["units"] == "DN"
@@ -137,43 +136,43 @@ def test_exposures_have_what_was_read_and_its_calibration(later):
         "no_data": 2,
         **FLAGS,
     }
-    one = data.isel(exposure=row).load()
-    good = one["dq"].values == 0
-    sky = np.median(one["image"].values[good])
-    pulls = ((one["image"] - one["truth"] - sky) / np.sqrt(one["variance"])).values[good]
+    exposure = data.isel(exposure=row).load()
+    good = exposure["dq"].values == 0
+    sky = np.median(exposure["image"].values[good])
+    pulls = ((exposure["image"] - exposure["truth"] - sky) / np.sqrt(exposure["variance"])).values[good]
     assert pulls.std() == pytest.approx(1, abs=0.03)
-    raw = one["raw"].values
+    raw = exposure["raw"].values
     assert raw.dtype == np.uint16
     assert 6000 < np.median(raw) < 7500
-    assert (one["dq"].values & COSMIC_RAY_FLAG > 0).mean() == pytest.approx(1.4e-3, rel=0.3)
-    # coadds leave out what is flagged: no pixel of the tile shows a cosmic ray or a hot pixel alone
+    assert (exposure["dq"].values & COSMIC_RAY_FLAG > 0).mean() == pytest.approx(1.4e-3, rel=0.3)
+    # flagged pixels do not enter coadds, but most of the tile is covered
     coadd = survey.coadds("roman").isel(tile=0, band=0).load()
     assert (coadd["weight"] > 0).mean() > 0.9
 
 
-def test_persistence_is_what_the_exposure_before_left(later):
+def test_persistence_equals_the_charge_left_by_the_earlier_exposure(later):
     survey, row, earlier = later
     product = survey.output("exposures/roman")
     renderer = product.renderer
     left = renderer.left_by(earlier)
-    # the same from the store and worked out again
+    # the stored table equals the recomputed one
     pd.testing.assert_frame_equal(left, replace(renderer, store=None).left_by(earlier))
     view = renderer.view(row)
     without = renderer.readout(view, [])
     stored = product.load(row)
-    before_it = Exposure(**vars(view.exposure) | {"mjd": survey.pointings("roman")["mjd"].iat[earlier]})
-    expected = left["charge"].to_numpy() / age(before_it, view.exposure) * view.exposure.exptime
+    earlier_exposure = replace(view.exposure, mjd=survey.pointings("roman")["mjd"].iat[earlier])
+    expected = left["charge"].to_numpy() / age(earlier_exposure, view.exposure) * view.exposure.exptime
     change = (stored["image"] - without["image"]).ravel()
     strong = left["charge"].to_numpy() > 0.5
-    fine = usable(stored["dq"].ravel()[left["pixel"]])
-    chosen = left["pixel"].to_numpy()[strong & fine]
-    scatter = np.sqrt(expected[strong & fine].sum() * 8) / len(chosen)
-    assert change[chosen].mean() == pytest.approx(expected[strong & fine].mean(), abs=4 * scatter)
+    unflagged = usable(stored["dq"].ravel()[left["pixel"]])
+    chosen = left["pixel"].to_numpy()[strong & unflagged]
+    scatter = np.sqrt(expected[strong & unflagged].sum() * 8) / len(chosen)
+    assert change[chosen].mean() == pytest.approx(expected[strong & unflagged].mean(), abs=4 * scatter)
     flagged = np.flatnonzero(stored["dq"].ravel() & PERSISTENCE)
     np.testing.assert_array_equal(flagged, np.sort(left["pixel"].to_numpy()[expected > 1]))
 
 
-def test_every_effect_shows_by_itself(later):
+def test_images_of_each_effect(later):
     survey, row, _ = later
     found = survey.output("exposures/roman").effects(row)
     assert list(found) == [
@@ -189,7 +188,7 @@ def test_every_effect_shows_by_itself(later):
         "read noise",
         "cosmic rays",
     ]
-    # whole numbers of 1.6 electrons: a pixel's differences come in steps, and their sums are good to some hundred
+    # data numbers of 1.6 electrons: differences are quantised, and their sums are accurate to some hundred electrons
     assert found["read noise"].std() == pytest.approx(8.5 * np.sqrt(1 + 0.1**2), rel=0.15)
     assert found["dark current"].mean() > 0.015 * 139.8 * 0.8
     assert abs(found["brighter-fatter"].sum()) < 300
@@ -203,7 +202,7 @@ def test_every_effect_shows_by_itself(later):
     assert Image.open(io.BytesIO(figures.effects(found))).size[0] > 1000
 
 
-def test_a_run_that_resumes_makes_the_same_and_draws_nothing_twice(full_store, later):
+def test_a_resumed_run_makes_identical_output_and_only_missing_units(full_store, later):
     survey, row, _ = later
     names = survey.output("exposures/roman").names
     stage, store = "exposures/roman", survey.store
@@ -217,24 +216,24 @@ def test_a_run_that_resumes_makes_the_same_and_draws_nothing_twice(full_store, l
     assert [name for name in names if again[name] != times[name]] == [names[row]]
 
 
-def test_wrong_calibrations_are_told_before_anything_is_made(tmp_path):
-    def refused(*overrides):
+def test_wrong_calibrations_are_reported_before_the_run_starts(tmp_path):
+    def error_of(*overrides):
         done = command("run", "tiny", *MINI, *overrides, "--store", "none", cwd=tmp_path)
         assert done.returncode == 2, done.stdout + done.stderr
         assert "Traceback" not in done.stderr + done.stdout
         assert not (tmp_path / "none").exists()
         return " ".join((done.stderr + done.stdout).split())
 
-    assert "need detector: sca" in refused("roman.cosmic_rays=true")
-    assert "leave it out" in refused("roman.detector=sca", "roman.charge_diffusion=0.3")
+    assert "need detector: sca" in error_of("roman.cosmic_rays=true")
+    assert "leave it out" in error_of("roman.detector=sca", "roman.charge_diffusion=0.3")
     full = ("roman.detector=sca", "roman.calibration=calib")
-    assert "is no folder" in refused(*full)
+    assert "is no folder" in error_of(*full)
     (tmp_path / "calib").mkdir()
-    text = refused(*full)
+    text = error_of(*full)
     assert "sca01.fits" in text
     assert "romandask calibration make" in text
     for name in ("sca01.fits", "sca10.fits"):
         fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.zeros((3, 3)), name="GAIN")]).writeto(
             tmp_path / "calib" / name
         )
-    assert "sca01.fits: extensions SOURCES" in refused(*full)
+    assert "sca01.fits: extensions SOURCES" in error_of(*full)

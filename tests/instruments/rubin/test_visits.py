@@ -1,4 +1,4 @@
-"""Rubin's visits: the PSF over the field, bright stars through silicon, and coadds against those drawn whole."""
+"""Rubin's visits: variation of the PSF, the silicon model, and warped coadds against directly drawn ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,9 @@ import pytest
 import sep
 
 from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.rubin.rubin import DEGREE, Rubin, RubinSettings
+from romandask.instruments.rubin.psf import DEGREE
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.rubin.settings import RubinSettings
 from romandask.kernels.coadding.warp import REACH
 from romandask.kernels.rendering.psf import place_grid
 from romandask.kernels.rendering.seeing import (
@@ -32,30 +34,30 @@ from romandask.stages.truth.catalogs import truth
 
 SHAPE = (600, 616)
 VISITS = 12
-SIDE = 30 / 3600
-REGION = Region(53 - SIDE / 0.766, 53 + SIDE / 0.766, -40 - SIDE, -40 + SIDE)
+HALF_SIDE = 30 / 3600
+REGION = Region(53 - HALF_SIDE / 0.766, 53 + HALF_SIDE / 0.766, -40 - HALF_SIDE, -40 + HALF_SIDE)
 
 
 def rubin_of(mode: str, **settings) -> Rubin:
-    """Return a camera whose detectors are small."""
+    """Return Rubin with small detectors."""
     return replace(Rubin(RubinSettings(bands=("i",), mode=mode, **settings), n_waves=3, seed=5), shape=SHAPE)
 
 
 def visits(count: int = VISITS) -> list[Exposure]:
-    """Return visits of one detector, the central one, dithered by some arcseconds and turned."""
+    """Return visits of the central detector, dithered by some arcseconds and rotated."""
     random = rng(3, "visits")
-    shift, turn = random.uniform(-8 / 3600, 8 / 3600, (count, 2)), random.uniform(0, 360, count)
+    shift, angle = random.uniform(-8 / 3600, 8 / 3600, (count, 2)), random.uniform(0, 360, count)
     seeing, airmass = random.uniform(0.5, 0.8, count), random.uniform(1, 1.4, count)
     return [
         Exposure(
-            k,
-            94,
-            "i",
-            61000.0 + k,
-            30.0,
-            53 + shift[k, 0] / 0.766,
-            -40 + shift[k, 1],
-            turn[k],
+            visit=k,
+            detector=94,
+            band="i",
+            mjd=61000.0 + k,
+            exptime=30.0,
+            ra=53 + shift[k, 0] / 0.766,
+            dec=-40 + shift[k, 1],
+            pa=angle[k],
             seeing=seeing[k],
             airmass=airmass[k],
             sky_brightness=20.3,
@@ -64,13 +66,14 @@ def visits(count: int = VISITS) -> list[Exposure]:
     ]
 
 
-def table_of(rubin: Rubin, every: list[Exposure]) -> pd.DataFrame:
-    corners = [footprint(rubin.header(exposure), rubin.shape).ravel() for exposure in every]
-    return pd.DataFrame([vars(e) | dict(zip(CORNERS, c, strict=True)) for e, c in zip(every, corners, strict=True)])
+def table_of(rubin: Rubin, exposures: list[Exposure]) -> pd.DataFrame:
+    """Return the pointings table of some exposures."""
+    corners = [footprint(rubin.header(exposure), rubin.shape).ravel() for exposure in exposures]
+    return pd.DataFrame([vars(e) | dict(zip(CORNERS, c, strict=True)) for e, c in zip(exposures, corners, strict=True)])
 
 
-def survey(mode: str, every: list[Exposure] | None = None, **settings):
-    """Return the lazy exposures and coadd of a crowded field of stars and galaxies."""
+def survey(mode: str, chosen: list[Exposure] | None = None, **settings):
+    """Return the lazy exposures, the lazy coadds and the tile of a crowded field of stars and galaxies."""
     rubin = rubin_of(mode, **settings)
     catalogs = truth(
         TruthSettings(order=11, margin=20.0, nside=64, stars=80, galaxies=150),
@@ -79,7 +82,7 @@ def survey(mode: str, every: list[Exposure] | None = None, **settings):
         {"i": rubin.bandpass("i")},
         5,
     )
-    product = exposures(table_of(rubin, every or visits()), catalogs, rubin, RenderSettings(n_waves=3), 5)
+    product = exposures(table_of(rubin, chosen or visits()), catalogs, rubin, RenderSettings(n_waves=3), 5)
     grid = CoaddSettings(pixels=1000, overlap=60)
     tile = next(tile for tile in grid.grid().covering(REGION) if tile.id == grid.grid().owner(53.0, -40.0))
     return product, coadds(product, [tile], grid), tile
@@ -87,18 +90,18 @@ def survey(mode: str, every: list[Exposure] | None = None, **settings):
 
 @pytest.fixture(scope="module")
 def both():
-    """The tile warped from visits, and the same drawn at once."""
+    """The tile warped from visits, the same tile drawn directly, and its definition."""
     (_, warped, tile), (_, drawn, _) = survey("visits"), survey("coadd")
     return warped.load(0), drawn.load(0), tile
 
 
-def test_the_psf_varies_as_the_pattern_of_its_visit_says():
+def test_statistics_of_the_psf_patterns():
     every = np.stack([pattern(rng(1, "psf", k)).atmosphere([0.0, 4000.0], [0.0, -2000.0]) for k in range(2000)])
     size, plus = every[..., :2].mean(axis=-1), (every[..., 0] - every[..., 1]) / 2
     for part in (size, plus, every[..., 2]):
         assert part.mean() == pytest.approx(0, abs=4 * ATMOSPHERE_RMS / np.sqrt(2000))
         assert part.std() == pytest.approx(ATMOSPHERE_RMS, rel=0.1)
-    # near by the turbulence is the same, far off it is another
+    # turbulence is correlated over short distances and uncorrelated over long ones
     near = np.stack([pattern(rng(1, "psf", k)).atmosphere([0.0, 20.0], [0.0, 0.0]) for k in range(500)])[..., 2]
     assert np.corrcoef(near.T)[0, 1] > 0.98
     assert abs(np.corrcoef(every[..., 2].T)[0, 1]) < 0.3
@@ -111,37 +114,37 @@ def test_the_psf_varies_as_the_pattern_of_its_visit_says():
     assert (middle[:, 0] - middle[:, 1]).std() / 2 == pytest.approx(TELESCOPE_ELLIPTICITY_RMS * np.sqrt(0.5), rel=0.15)
 
 
-def test_over_a_detector_the_psf_is_galsims_of_every_place():
-    """At the edge of the field, where it varies most; drawn from the polynomials, and by GalSim where it is."""
+def test_psf_over_a_detector_agrees_with_galsim():
+    """At the edge of the field, where the PSF varies most: the polynomial model against GalSim profiles."""
     rubin = Rubin(RubinSettings(bands=("i",), mode="visits"), n_waves=2, seed=5)
     exposure = replace(visits(1)[0], detector=3)
     shares = flat_shares(rubin.bandpass("i"))
-    model, sizes = rubin.psf(exposure), []
+    model, moments = rubin.psf(exposure), []
     assert len(place_grid(rubin.shape, DEGREE)) > 6
     for x, y in ((200.0, 300.0), (3900.0, 3500.0), (2035.5, 1999.5)):
         weights = model.weights(shares[None], np.array([x]), np.array([y]))[0]
         mean = np.tensordot(weights, model.modes, 1)
         nodes = rubin.profiles(exposure, x, y)
         psf = galsim.Sum([one * share for one, share in zip(nodes, shares, strict=True)])
-        seen = galsim.Convolve(psf, galsim.Pixel(0.2))
+        with_pixel = galsim.Convolve(psf, galsim.Pixel(0.2))
         rows, columns = (axis / 0.2 for axis in model.core.axes())
-        some = [(40, 10), (128, 0), (150, 25), (120, 40)]
-        expected = [seen.kValue(columns[i], rows[j]) for j, i in some]
-        np.testing.assert_allclose([mean[j, i] for j, i in some], expected, atol=1e-3)
+        chosen = [(40, 10), (128, 0), (150, 25), (120, 40)]
+        expected = [with_pixel.kValue(columns[i], rows[j]) for j, i in chosen]
+        np.testing.assert_allclose([mean[j, i] for j, i in chosen], expected, atol=1e-3)
         exact = psf_image(rubin, exposure, x, y)
-        sizes.append(galsim.hsm.FindAdaptiveMom(galsim.ImageD(exact.astype(float))))
-    shapes = np.array([[one.moments_sigma, one.observed_shape.g1, one.observed_shape.g2] for one in sizes])
+        moments.append(galsim.hsm.FindAdaptiveMom(galsim.ImageD(exact.astype(float))))
+    shapes = np.array([[one.moments_sigma, one.observed_shape.g1, one.observed_shape.g2] for one in moments])
     assert np.ptp(shapes, axis=0).max() > 2e-3
 
 
-def test_an_exposure_has_what_was_read_and_its_calibration():
-    # long enough for some cosmic rays on a small detector
-    every = [replace(visits(1)[0], exptime=900.0)]
-    product, _, _ = survey("visits", every)
+def test_an_exposure_has_raw_data_and_a_calibrated_image():
+    # an exposure long enough for some cosmic rays on a small detector
+    chosen = [replace(visits(1)[0], exptime=900.0)]
+    product, _, _ = survey("visits", chosen)
     made = product.load(0)
     assert made["raw"].dtype == np.int32
     assert made["raw"].min() > 20_000
-    again = survey("visits", every)[0].load(0)
+    again = survey("visits", chosen)[0].load(0)
     for name, plane in made.items():
         np.testing.assert_array_equal(plane, again[name])
     view = product.renderer.view(0)
@@ -149,13 +152,13 @@ def test_an_exposure_has_what_was_read_and_its_calibration():
     assert 0 < rays.sum() < 0.01 * rays.size
     good = made["dq"] == 0
     pull = (made["image"] - made["truth"] - view.background)[good] / np.sqrt(made["variance"][good])
-    # robustly: the last pixels that charge overflows to are not full
+    # robust statistics, because the last pixels of a blooming trail are not full and not flagged
     assert np.median(pull) == pytest.approx(0, abs=0.01)
     assert 1.4826 * np.median(np.abs(pull)) == pytest.approx(1, abs=0.01)
 
 
-def test_visits_and_tiles_drawn_at_once_agree(both):
-    """Weights, depth, PSF; positions within 0.02 arcsec and fluxes within their errors."""
+def test_warped_and_drawn_tiles_agree(both):
+    """Weights, depth and PSF agree, positions within 0.02 arcsec and fluxes within their errors."""
     warped, drawn, tile = both
     covered = (warped["nimages"] == VISITS) & (drawn["nimages"] == VISITS) & (warped["dq"] == 0)
     assert covered.mean() > 0.3
@@ -163,7 +166,7 @@ def test_visits_and_tiles_drawn_at_once_agree(both):
     assert np.abs(warped["psf"] - drawn["psf"]).max() < 0.01 * drawn["psf"].max()
     images = [np.ascontiguousarray(one["image"]) for one in (warped, drawn)]
     mask = ~covered
-    # depth: scatter of apertures on the noise of each
+    # depth, from the scatter of aperture fluxes in the noise realisations
     random = rng(1, "apertures")
     x, y = random.uniform(20, 268, (2, 3000))
     fluxes = [sep.sum_circle(np.ascontiguousarray(one["noise"][0]), x, y, 4.0, mask=mask) for one in (warped, drawn)]
@@ -183,35 +186,37 @@ def test_visits_and_tiles_drawn_at_once_agree(both):
     bright = clean.copy()
     bright[clean] = flux[1] > 60 * rms * np.sqrt(np.pi * 25)
     assert bright.sum() >= 8
-    places = [sep.winpos(image, found["x"][bright], found["y"][bright], 1.5, mask=mask)[:2] for image in images]
-    offset = 0.2 * (np.array(places[0]) - np.array(places[1]))
+    positions = [sep.winpos(image, found["x"][bright], found["y"][bright], 1.5, mask=mask)[:2] for image in images]
+    offset = 0.2 * (np.array(positions[0]) - np.array(positions[1]))
     assert np.abs(np.median(offset, axis=1)).max() < 0.01
     assert np.sqrt(np.mean(offset**2)) < 0.02
 
 
-def test_noise_of_warped_tiles_tells_their_correlations(both):
-    """The noise realisation has the scatter and correlations of the image's own noise: of what Lanczos-3 leaves."""
+def test_noise_realisations_of_warped_tiles_are_correlated(both):
+    """The scatter of the noise realisation is that of uncorrelated noise after Lanczos-3 interpolation."""
     warped, drawn, _ = both
     covered = (warped["nimages"] == VISITS) & (drawn["nimages"] == VISITS)
     ratio = warped["noise"][0][covered].std() * np.sqrt(np.median(warped["weight"][covered]))
-    place = np.linspace(0, 1, 101)[:-1, None] - np.arange(1 - REACH, REACH + 1)
-    weights = np.sinc(place) * np.sinc(place / REACH)
+    fraction = np.linspace(0, 1, 101)[:-1, None] - np.arange(1 - REACH, REACH + 1)
+    weights = np.sinc(fraction) * np.sinc(fraction / REACH)
     weights /= weights.sum(axis=1, keepdims=True)
     assert ratio == pytest.approx(np.mean((weights**2).sum(axis=1)), rel=0.03)
 
 
-def test_bright_stars_are_fatter_through_silicon_and_keep_their_flux():
-    """Isolated stars just below saturation, in one exposure through silicon and in the same without it."""
+def test_silicon_model_broadens_bright_stars_and_keeps_their_flux():
+    """Isolated stars just below saturation, in the same exposure with and without the silicon model."""
     made = {}
     for sensor in ("ideal", "silicon"):
         product, _, _ = survey("visits", visits(1), sensor=sensor, cosmic_rays=False)
         made[sensor] = product.make(0)
     view = product.renderer.view(0)
     scene, fluxes = view.drawable.scene, view.drawable.scene.fluxes()
-    apart = np.hypot(scene.x[:, None] - scene.x, scene.y[:, None] - scene.y) + 1e9 * (fluxes < 0.05 * fluxes[:, None])
-    np.fill_diagonal(apart, 1e9)
+    distance = np.hypot(scene.x[:, None] - scene.x, scene.y[:, None] - scene.y) + 1e9 * (
+        fluxes < 0.05 * fluxes[:, None]
+    )
+    np.fill_diagonal(distance, 1e9)
     edge = np.minimum(np.minimum(scene.x, SHAPE[1] - scene.x), np.minimum(scene.y, SHAPE[0] - scene.y))
-    chosen = np.flatnonzero((fluxes > 4e5) & (fluxes < 1.5e6) & (apart.min(axis=1) > 25) & (edge > 40))
+    chosen = np.flatnonzero((fluxes > 4e5) & (fluxes < 1.5e6) & (distance.min(axis=1) > 25) & (edge > 40))
     assert len(chosen) >= 3
     growth = []
     for n in chosen:
@@ -222,8 +227,8 @@ def test_bright_stars_are_fatter_through_silicon_and_keep_their_flux():
         assert stamps[1].sum() == pytest.approx(stamps[0].sum(), abs=4 * error + 0.003 * fluxes[n])
         sizes = [galsim.hsm.FindAdaptiveMom(galsim.ImageD(stamp)).moments_sigma for stamp in stamps]
         growth.append((sizes[1] / sizes[0] - 1) / fluxes[n])
-    # charge pushes away what comes after: some tenths of a per cent, the more the brighter
+    # collected charge repels later charge: the size grows by some tenths of a per cent, in proportion to the flux
     assert 1e-3 < np.median(growth) * 1e6 < 3e-2
-    # what is drawn without silicon is the same in both, and so is the noiseless image
+    # the noiseless image does not depend on the sensor
     np.testing.assert_allclose(made["ideal"]["truth"], made["silicon"]["truth"], rtol=1e-4, atol=0.5)
     assert (fluxes[chosen] > MIN_ELECTRONS).all()

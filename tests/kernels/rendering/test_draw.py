@@ -9,7 +9,8 @@ from astropy.wcs import WCS
 
 from romandask.ingest.spectra import galaxy_templates
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.rendering import draw as render
 from romandask.kernels.rendering.draw import Scene, plan_stamps, stamp_sizes
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, knot_offset
@@ -215,7 +216,7 @@ def test_objects_outside_the_image_contribute_light(psf_model):
 def test_a_truth_row_agrees_with_galsim_in_spectra_lensing_and_wcs():
     """A redshifted, lensed galaxy of two components with different spectra, drawn by GalSim's chromatic classes."""
     roman = Roman(RomanSettings(psf_degree=0), n_waves=3)
-    exposure = Exposure(0, 7, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)
+    exposure = Exposure(visit=0, detector=7, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
     header = roman.header(exposure)
     wcs = WCS(header)
     ra, dec = wcs.all_pix2world(3000.3, 1200.6, 0)

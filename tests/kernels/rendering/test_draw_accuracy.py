@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.rendering.draw import Scene, draw, plan_stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
 from romandask.kernels.rendering.galsim_engine import component_profile, object_profile
@@ -37,7 +38,7 @@ GRID = [
 
 
 def exposure(band):
-    return Exposure(1, 7, band, 61541.0, 139.8, 53.0, -40.0, 120.0)
+    return Exposure(visit=1, detector=7, band=band, mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
 
 
 @lru_cache(maxsize=4)

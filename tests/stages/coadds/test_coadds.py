@@ -12,8 +12,10 @@ from drizzle.resample import Drizzle
 from scipy import ndimage
 
 from romandask.instruments.exposure import Exposure, pixel_areas
-from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.rubin.settings import RubinSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.coadding.stack import stack
@@ -51,7 +53,8 @@ def target_of(small, pixels=500):
 
 
 def test_the_interpolated_map_is_exact_to_a_thousandth_of_a_pixel():
-    header = Roman(RomanSettings()).header(Exposure(0, 9, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0))
+    exposure = Exposure(visit=0, detector=9, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
+    header = Roman(RomanSettings()).header(exposure)
     source = WCS(header)
     ra, dec = source.all_pix2world(2044, 2044, 0)
     target = WCS(tangent_header(float(ra), float(dec), 8825, 0.0575))
@@ -206,7 +209,8 @@ def test_an_image_elsewhere_has_no_strips(small):
 @pytest.mark.parametrize("pixels", [1000, 1907, 2345, 3400])
 def test_strips_cover_the_part_without_slivers(pixels):
     """A strip of a row is what would be left of 1025 rows in strips of 512."""
-    source = WCS(Roman(RomanSettings()).header(Exposure(0, 9, "H158", 61541.0, 139.8, 53.0, -40.0, 120.0)))
+    exposure = Exposure(visit=0, detector=9, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
+    source = WCS(Roman(RomanSettings()).header(exposure))
     ra, dec = source.all_pix2world(2044, 3000, 0)
     target = WCS(tangent_header(float(ra), float(dec), pixels, 0.0575))
     found = strips(source, (4088, 4088), target, (pixels, pixels))

@@ -9,7 +9,8 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy.special import erf
 
-from romandask.instruments.rubin.rubin import Rubin, RubinSettings
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.rubin.settings import RubinSettings
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map

@@ -267,7 +267,7 @@ STRUCTURE = Stage(
     build=_structure,
     exists=_generated_truth,
     unit="survey",
-    summary="Matter of the generated universe in redshift shells on the sky, with the convergence and shear that it causes.",
+    summary="Matter of the generated universe in redshift shells on the sky, with its convergence and shear.",
     shrink_with="lower truth.nside",
 )
 INGESTED = Stage(

@@ -29,9 +29,9 @@ from romandask.stages.detections.truth_match import completeness
 from romandask.stages.detections.zero_points import FLUXES
 from romandask.stages.pointings import visits
 from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
-from romandask.storage.manifest import read_records
 from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 from romandask.storage.store import Store
+from romandask.survey_repr import html_of, text_of
 
 Value = TypeVar("Value")
 
@@ -391,14 +391,10 @@ class Survey:
         return _select(self.instruments, survey)
 
     def __repr__(self) -> str:
-        place = self.store.root if self.store else "not stored"
-        lines = [f"Survey {self.pipeline.name} ({place})"]
-        if self.store:
-            for stage in self.store.stages():
-                records = [record for _, record in read_records(self.store, stage) if record]
-                size = sum(record.bytes for record in records)
-                lines.append(f"  {stage:20s} {len(records):6d} units {size / 1e6:12.1f} MB")
-        return "\n".join(lines)
+        return text_of(self)
+
+    def _repr_html_(self) -> str:
+        return html_of(self)
 
 
 def _select(values: Mapping[str, Value], name: str) -> Value:

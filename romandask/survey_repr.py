@@ -14,8 +14,14 @@ from romandask.storage.store import Store
 
 _MAP_PIXELS = 320
 """Width of the map."""
-_MOST_OUTLINES = 2000
-"""Exposures whose outlines are drawn; of more an even selection is."""
+_MOST_OUTLINES = 500
+"""Largest number of exposures drawn for a telescope; of more, every second, third and so on is drawn."""
+_DEEPEST = 30
+"""Largest mean number of overlapping exposures drawn for a telescope."""
+_MARGIN = 1.6
+"""Width of the map over that of the tiles."""
+_COLOURS = ("#c0392b", "#2471a3", "#8e44ad", "#d68910")
+"""Colours of the telescopes."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +62,19 @@ def _bytes(path: AnyPath) -> int:
     return bytes_below(path) if path.exists() else 0
 
 
+def _size(number: int) -> str:
+    """Return a number of bytes as text."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6)):
+        if number >= factor:
+            return f"{number / factor:,.1f} {unit}"
+    return f"{number / 1e3:,.1f} kB"
+
+
 def text_of(survey: SurveyContext) -> str:
     """Return the survey as text: its name, where it is stored, and a line a stage."""
     place = survey.store.root if survey.store else "not stored"
     lines = [f"Survey {survey.pipeline.name} ({place})"]
-    lines += [f"  {line.stage:22s} {line.units:6d} units {line.bytes / 1e6:12.1f} MB" for line in stage_lines(survey)]
+    lines += [f"  {line.stage:24s} {line.units:6d} units {_size(line.bytes):>10s}" for line in stage_lines(survey)]
     return "\n".join(lines)
 
 
@@ -75,14 +89,14 @@ def html_of(survey: SurveyContext) -> str:
     about += [f"{one.title}: {', '.join(one.bands)}" for one in survey.instruments.values()]
     rows = "".join(
         f"<tr><td style='text-align:left'>{html.escape(line.stage)}</td><td>{line.units}</td>"
-        f"<td>{line.bytes / 1e6:,.1f}</td></tr>"
+        f"<td>{_size(line.bytes)}</td></tr>"
         for line in lines
     )
     total = sum(line.bytes for line in lines)
     table = (
         f"<details><summary>{sum(line.units for line in lines)} units of {len(lines)} stages, "
-        f"{total / 1e6:,.0f} MB on disk</summary><table><thead><tr><th style='text-align:left'>stage</th><th>units</th>"
-        f"<th>MB on disk</th></tr></thead><tbody>{rows}</tbody></table></details>"
+        f"{_size(total)} on disk</summary><table><thead><tr><th style='text-align:left'>stage</th><th>units</th>"
+        f"<th>on disk</th></tr></thead><tbody>{rows}</tbody></table></details>"
         if lines
         else ""
     )
@@ -95,7 +109,10 @@ def html_of(survey: SurveyContext) -> str:
 
 
 def footprint_svg(survey: SurveyContext) -> str:
-    """Return a map (SVG): the tiles, the region, and the exposures that the store knows of."""
+    """Return a map (SVG) of the region, the tiles and the stored pointings, with a legend below it.
+
+    North is up and east is left. Exposures are transparent: where more of them overlap, the map is darker.
+    """
     region, (ra, dec) = survey.region, survey.region.centre
     stretch = np.cos(np.radians(dec))
 
@@ -107,28 +124,36 @@ def footprint_svg(survey: SurveyContext) -> str:
     edge = np.array([(west, region.dec_min), (east, region.dec_min), (east, region.dec_max), (west, region.dec_max)])
     grid = survey.pipeline.coadds.grid()
     tiles = np.stack([tile.corners(grid.inner) for tile in survey.tiles])
-    shapes = [("#d7e3f4", "#45607f", plane(tiles))]
-    for colour, name in zip(("#c0392b", "#2e7d32", "#8e44ad"), survey.instruments, strict=False):
-        if survey.store is not None and survey.store.table(f"pointings/{name}", "all").exists():
-            outlines = survey.pointings(name).filter(regex=r"^(ra|dec)_\d$")
-            corners = outlines.to_numpy(float).reshape(-1, 4, 2)
-            shapes.append(("none", colour, plane(corners[:: max(1, len(corners) // _MOST_OUTLINES)])))
-    shapes.append(("none", "#000000", plane(edge)[None]))
+    outlines = {
+        name: plane(survey.pointings(name).filter(regex=r"^(ra|dec)_\d$").to_numpy(float).reshape(-1, 4, 2))
+        for name in survey.instruments
+        if survey.store is not None and survey.store.table(f"pointings/{name}", "all").exists()
+    }
     shown = plane(np.concatenate([tiles.reshape(-1, 2), edge]))
-    low, size = shown.min(axis=0), np.ptp(shown, axis=0).max() * 1.3 or 1.0
-    low = low - (size - np.ptp(shown, axis=0)) / 2
-    scale = _MAP_PIXELS / size
-    drawn = "".join(
-        f"<polygon points='{_points((polygon - low) * scale)}' fill='{fill}' stroke='{stroke}' stroke-width='0.7'/>"
-        for fill, stroke, polygons in shapes
-        for polygon in polygons
-    )
-    titles = "tiles (blue), region (black), exposures by telescope (red, green)"
+    # a region smaller than an exposure is shown with the exposures around it
+    extents = [np.ptp(corners, axis=1).max() for corners in outlines.values() if len(corners)]
+    size = max(np.ptp(shown, axis=0).max() * _MARGIN, 2 * min(extents, default=0.0))
+    low = shown.min(axis=0) - (size - np.ptp(shown, axis=0)) / 2
+
+    def drawn(polygons: np.ndarray, fill: str, opacity: float, stroke: str, width: float = 1.0) -> str:
+        points = (" ".join(f"{x:.1f},{y:.1f}" for x, y in corner) for corner in (polygons - low) * _MAP_PIXELS / size)
+        shapes = "".join(f"<polygon points='{one}'/>" for one in points)
+        return f"<g fill='{fill}' fill-opacity='{opacity:g}' stroke='{stroke}' stroke-width='{width}'>{shapes}</g>"
+
+    layers, legend = [], []
+    for number, (name, corners) in enumerate(outlines.items()):
+        colour = _COLOURS[number % len(_COLOURS)]
+        # depth of the overlap, were the exposures spread over the map
+        depth = np.prod(np.ptp(corners, axis=1), axis=1).sum() / size**2
+        step = max(1, int(np.ceil(depth / _DEEPEST)), int(np.ceil(len(corners) / _MOST_OUTLINES)))
+        opacity = float(np.clip(0.4 * step / max(depth, 1e-9), 0.01, 0.1))
+        layers.insert(0, drawn(corners[::step], colour, opacity, colour, 0.15))
+        title = html.escape(survey.instruments[name].title)
+        legend.append(f"<span style='color:{colour}'>{title}: {len(corners)} exposures</span>")
+    layers += [drawn(plane(tiles), "none", 0, "#555555"), drawn(plane(edge)[None], "none", 0, "#000000")]
+    legend += ["<span style='color:#555555'>tiles</span>", "region"]
     return (
         f"<svg width='{_MAP_PIXELS}' height='{_MAP_PIXELS}' viewBox='0 0 {_MAP_PIXELS} {_MAP_PIXELS}' "
-        f"style='background:#fff'><title>{titles}</title>{drawn}</svg>"
+        f"style='background:#fff;border:1px solid #ccc'>{''.join(layers)}</svg>"
+        f"<div style='font-size:85%'>{', '.join(legend)}; {size * 60:.3g} arcmin wide</div>"
     )
-
-
-def _points(polygon: np.ndarray) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in polygon)

@@ -1,4 +1,4 @@
-"""Cutouts of objects: the right pixels, places, PSFs and Jacobians, lazily; MEDS files against GalSim's own writer."""
+"""Cutouts of objects: pixels, positions, PSFs, Jacobians and laziness; MEDS files compared with those of GalSim."""
 
 import dask
 import galsim
@@ -24,7 +24,7 @@ LAYERS = ("image", "truth", "dq", "background", "weight", "psf")
 
 @pytest.fixture(scope="module")
 def objects(small) -> pd.DataFrame:
-    """Thirty galaxies, some of them off every detector or near an edge."""
+    """Thirty galaxies, some of which lie outside all detectors or near an edge."""
     rows = small.truth.galaxies.all_rows()
     return rows.iloc[:: len(rows) // 30][["galaxy_id", "ra", "dec"]].set_axis(["id", "ra", "dec"], axis=1)
 
@@ -34,7 +34,7 @@ def found(small, objects):
     return cutouts(small.product, objects.reset_index(drop=True), LAYERS, size=SIZE).compute()
 
 
-def test_every_image_that_sees_the_centre_of_an_object_has_a_cutout_of_it(small, objects, found):
+def test_every_image_that_contains_the_centre_of_an_object_has_a_cutout_of_it(small, objects, found):
     expected = set()
     for exposure in small.exposures:
         x, y = WCS(small.roman.header(exposure)).all_world2pix(objects["ra"], objects["dec"], 0)
@@ -76,7 +76,7 @@ def test_weights_are_the_inverse_variance_of_an_empty_pixel(small, found):
     np.testing.assert_allclose(one["weight"], 1 / (one["background"] + galsim.roman.read_noise**2), rtol=1e-6)
 
 
-def test_psf_and_jacobian_are_galsims_at_the_place_of_the_object(small, found):
+def test_psf_and_jacobian_equal_those_of_galsim_at_the_object(small, found):
     shares = flat_shares(small.roman.bandpass("H158"))
     n = found.sizes["cutout"] // 2
     one = found.isel(cutout=n)
@@ -126,12 +126,12 @@ def test_bands_choose_images(small, objects):
         ({"size": 1000}, "size 1000: an even number"),
     ],
 )
-def test_what_cannot_be_cut_is_said(small, objects, arguments, message):
+def test_invalid_arguments_are_reported(small, objects, arguments, message):
     with pytest.raises(UserError, match=message):
         cutouts(small.product, objects, **arguments)
 
 
-def test_objects_that_no_image_sees_have_no_cutouts(small):
+def test_objects_on_no_image_have_no_cutouts(small):
     nowhere = pd.DataFrame({"id": [1], "ra": [10.0], "dec": [10.0]})
     lazy = cutouts(small.product, nowhere, ("image", "psf"), size=SIZE)
     assert lazy["image"].shape == (0, SIZE, SIZE)
@@ -159,7 +159,7 @@ def test_cutouts_of_coadds_are_pixels_of_the_tiles(small, objects):
         cutouts(product, objects, ("psf",))
 
 
-def test_objects_are_found_by_id_and_by_place(small):
+def test_objects_are_found_by_id_and_by_position(small):
     tables = (
         Positions(small.truth.galaxies, "galaxy_id", "ra", "dec"),
         Positions(small.truth.stars, "id", "ra", "dec"),
@@ -191,7 +191,7 @@ def test_positions_in_footprints_are_found_with_a_margin():
 
 
 def test_a_meds_file_is_what_galsim_writes(found, objects, tmp_path):
-    """Tables and pixels against galsim.des.WriteMEDS of the same cutouts, object by object."""
+    """Tables and pixels are compared, object by object, with those of galsim.des.WriteMEDS for the same cutouts."""
     rows = objects.reset_index(drop=True)
     seen = np.unique(found["object"])
     table = rows.iloc[seen].reset_index(drop=True)

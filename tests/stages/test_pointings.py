@@ -1,4 +1,4 @@
-"""Observing sequences: the real files, the generated plans, and the join with tiles."""
+"""Pointings: real observing sequences, generated plans, and the selection of exposures that touch tiles."""
 
 import shutil
 import sqlite3

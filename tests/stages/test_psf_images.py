@@ -1,4 +1,4 @@
-"""PSF images of exposures, eight times finer than their pixels, against GalSim."""
+"""Oversampled PSF images of exposures, compared with GalSim."""
 
 from dataclasses import replace
 
@@ -15,13 +15,13 @@ from romandask.stages.psf_images import OVERSAMPLING, PSF_IMAGE_PIXELS, flat_sha
 
 
 def drawn(instrument, exposure, x, y):
-    """GalSim's image: its own PSFs at that place, weighted as the nodes of the band weight flat f_nu."""
+    """Return GalSim's image of a star of flat f_nu: the PSFs at a position, weighted by the light at each PSF node."""
     shares = flat_shares(instrument.bandpass(exposure.band))
     profiles = instrument.profiles(exposure, x, y)
     psf = galsim.Sum([profile * share for profile, share in zip(profiles, shares, strict=True)])
     seen = galsim.Convolve(psf, galsim.Pixel(instrument.pixel_scale))
     side, scale = PSF_IMAGE_PIXELS * OVERSAMPLING, instrument.pixel_scale / OVERSAMPLING
-    # centred on a sample; each sample is the light of a native pixel
+    # the star is centred on a sample, and each sample is the light in a native pixel
     image = seen.drawImage(nx=side, ny=side, scale=scale, offset=(0.5, 0.5), method="no_pixel", dtype=float)
     return image.array * OVERSAMPLING**2
 
@@ -30,12 +30,12 @@ def test_an_image_is_galsims_in_the_middle_of_the_detector(small):
     middle = (galsim.roman.n_pix - 1) / 2
     image = psf_image(small.roman, small.exposures[0], middle, middle)
     expected = drawn(small.roman, small.exposures[0], middle, middle)
-    # drawn so finely, GalSim's interpolation of its PSF has a little power beyond the limit of the optics
+    # at this sampling GalSim's interpolation of its PSF has a little power beyond the diffraction limit
     assert np.abs(image - expected).max() < 1e-3 * expected.max()
     assert image[4::OVERSAMPLING, 4::OVERSAMPLING].sum() == pytest.approx(expected[4::8, 4::8].sum(), rel=1e-3)
 
 
-def test_an_image_off_the_middle_is_that_of_its_place(small):
+def test_an_image_depends_on_the_position(small):
     corner, middle = 300.0, (galsim.roman.n_pix - 1) / 2
     expected = drawn(small.roman, small.exposures[0], corner, corner)
     assert np.abs(psf_image(small.roman, small.exposures[0], corner, corner) - expected).max() < 1e-3 * expected.max()
@@ -46,7 +46,7 @@ def test_an_image_off_the_middle_is_that_of_its_place(small):
 def test_without_variation_an_image_is_that_of_the_middle(small):
     roman = replace(small.roman, settings=RomanSettings(bands=("H158",), psf_degree=0))
     middle = (galsim.roman.n_pix - 1) / 2
-    images = [psf_image(roman, small.exposures[0], place, place) for place in (300.0, middle)]
+    images = [psf_image(roman, small.exposures[0], x, x) for x in (300.0, middle)]
     np.testing.assert_array_equal(*images)
 
 
@@ -56,7 +56,7 @@ def test_images_are_lazy_over_exposures(small):
     assert dataset.sizes["exposure"] == 3
     assert set(dataset["psf"].chunks[0]) == {1}
     first = dataset["psf"].sel(exposure=small.exposures[0].name).compute()
-    # the middle of the small detector is near the corner of the real one
+    # the centre of the small detector is near the corner of the real one
     np.testing.assert_array_equal(first, psf_image(small.roman, small.exposures[0], 149.5, 149.5))
     assert first.attrs["pixel_scale"] == pytest.approx(galsim.roman.pixel_scale / 8)
 

@@ -1,4 +1,4 @@
-"""The truth index: what is on an exposure, where, how bright, and what could not be drawn."""
+"""Truth index: objects on an exposure, their positions and magnitudes, and the reasons why some are not drawn."""
 
 from dataclasses import replace
 
@@ -17,11 +17,11 @@ def index(small) -> pd.DataFrame:
     return truth_index(small.product).load(0)
 
 
-def test_objects_are_where_the_wcs_has_them(small, index):
+def test_positions_agree_with_the_wcs(small, index):
     truth = small.truth.galaxies.all_rows().set_index("galaxy_id")
     rows = index[(index["kind"] == "galaxy") & index["drawn"]]
-    place = truth.loc[rows["id"]]
-    x, y = WCS(small.roman.header(small.exposures[0])).all_world2pix(place["ra"], place["dec"], 0)
+    true = truth.loc[rows["id"]]
+    x, y = WCS(small.roman.header(small.exposures[0])).all_world2pix(true["ra"], true["dec"], 0)
     np.testing.assert_allclose(rows["x"], x, atol=1e-6)
     np.testing.assert_allclose(rows["y"], y, atol=1e-6)
     assert (rows["stamp"] > 0).all()
@@ -49,7 +49,7 @@ def test_the_flux_of_what_is_drawn_is_in_the_image(small, index):
     assert inside < image.sum() < index["flux"].sum()
 
 
-def test_what_cannot_be_drawn_has_its_reason_and_no_pixel(small, index):
+def test_objects_that_cannot_be_drawn_have_a_reason_and_no_light(small, index):
     source: RenderExposure = small.product.renderer
     wrong = {
         "size_disk_true": (np.nan, BAD_SIZE),

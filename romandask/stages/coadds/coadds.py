@@ -217,7 +217,7 @@ COADDS = Stage(
     reads=("exposures", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="tile and band",
-    summary="Image, weight, noise realisations, number of exposures and PSF of a tile, drizzled from exposures (square "
+    summary="Image, weight, noise, number and sets of exposures, and PSFs of a tile, drizzled from exposures (square "
     "kernel, exact overlaps), warped from visits or drawn from the cadence at its depth.",
     shrink_with="lower coadds.pixels",
     tables={"sets": "coadds/<survey>_sets/"},

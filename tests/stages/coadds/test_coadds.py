@@ -1,7 +1,8 @@
-"""Resampling, and the lazy composition of exposures and coadds."""
+"""Drizzling of exposures onto tiles, and the lazy computation of exposures and coadds."""
 
 import itertools
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import dask
 import numpy as np
@@ -14,8 +15,6 @@ from scipy import ndimage
 from romandask.instruments.exposure import Exposure, pixel_areas
 from romandask.instruments.roman.roman import Roman
 from romandask.instruments.roman.settings import RomanSettings
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.coadding.stack import stack
@@ -34,17 +33,17 @@ CALLS: list[int] = []
 
 @dataclass(frozen=True)
 class Counting(RenderExposure):
-    """Renders, and notes which exposures."""
+    """Renders exposures, and records their indices in CALLS."""
 
     def __call__(self, index):
         CALLS.append(index)
         return super().__call__(index)
 
 
-def exposures_of_rubin(small):
-    """The small exposures, taken for those of an instrument whose coadds are drawn from its cadence."""
-    rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
-    return replace(small.product, renderer=replace(small.product.renderer, instrument=rubin))
+def exposures_for_drawn_coadds(small):
+    """Return the small exposures with an instrument whose coadds are not drizzled."""
+    renderer = replace(small.product.renderer, instrument=SimpleNamespace(coadd="draw"))
+    return replace(small.product, renderer=renderer)
 
 
 def target_of(small, pixels=500):
@@ -67,7 +66,7 @@ def test_the_interpolated_map_is_exact_to_a_thousandth_of_a_pixel():
 
 
 @pytest.mark.parametrize("rows", [slice(10, 11), slice(299, 300), slice(5, 8)])
-def test_the_map_of_few_rows_is_that_of_many(small, rows):
+def test_the_map_of_a_few_rows_equals_the_map_of_all(small, rows):
     """The last strip of an exposure may be a single row."""
     source, (target, _) = WCS(small.roman.header(small.exposures[0])), target_of(small)
     whole = pixel_map(source, target, slice(0, 300), slice(0, 300)).dense()
@@ -75,15 +74,15 @@ def test_the_map_of_few_rows_is_that_of_many(small, rows):
     np.testing.assert_allclose(pixel_map(source, target, slice(0, 300), rows).dense(), whole[:, rows], atol=1e-6)
 
 
-def test_the_map_at_some_pixels_is_that_of_all(small):
+def test_the_map_at_some_pixels_equals_the_dense_map(small):
     source, (target, _) = WCS(small.roman.header(small.exposures[0])), target_of(small)
     onto = pixel_map(source, target, slice(100, 300), slice(20, 280))
     rows, columns = np.random.default_rng(2).integers((100, 20), (300, 280), (500, 2)).T
     np.testing.assert_allclose(onto.at(rows, columns), onto.dense()[rows - 100, columns - 20], atol=1e-9)
 
 
-def test_tiles_are_marked_where_exposures_are_saturated(small):
-    """Everywhere that the light of a saturated pixel would have gone, and nowhere else."""
+def test_tiles_are_flagged_where_exposures_are_saturated(small):
+    """All tile pixels that a saturated pixel overlaps are flagged, and no pixels further than one pixel from them."""
     source, (target, shape) = WCS(small.roman.header(small.exposures[0])), target_of(small)
     parts = strips(source, (300, 300), target, shape)
     dq = np.zeros((300, 300), np.uint8)
@@ -176,29 +175,29 @@ def test_the_order_and_cut_of_strips_do_not_matter(small):
         np.testing.assert_allclose(first, second, atol=2e-5)
 
 
-def test_pixfrac_is_advised_from_the_weights_that_the_package_gives(small):
-    """A pixfrac is good where the drizzled weight has no holes and is even."""
+def test_pixfrac_is_recommended_from_the_weights_of_the_drizzle_package(small):
+    """A pixfrac is good if the drizzled weight is even and nowhere zero."""
     product = coadds(small.product, small.tiles, small.settings)
-    found = coverage(product)
-    assert [one.pixfrac for one in found] == CHOICES.tolist()
-    assert all(first.uneven > second.uneven for first, second in itertools.pairwise(found))
-    assert all(first.empty >= second.empty for first, second in itertools.pairwise(found))
-    one = found[4]
+    results = coverage(product)
+    assert [result.pixfrac for result in results] == CHOICES.tolist()
+    assert all(first.uneven > second.uneven for first, second in itertools.pairwise(results))
+    assert all(first.empty >= second.empty for first, second in itertools.pairwise(results))
+    result = results[4]
     k = int(np.argmax([len(product.make.members[k, "H158"]) for k in range(len(small.tiles))]))
     target = WCS(tangent_header(small.tiles[k].ra, small.tiles[k].dec, TEST_SQUARE_PIXELS, 0.0575))
     oracle = Drizzle(kernel="square", fillval="0", out_shape=(TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS), disable_ctx=True)
     for exposure in small.exposures:
         whole = pixel_map(WCS(small.roman.header(exposure)), target, slice(0, 300), slice(0, 300)).dense()
         plane = np.ones(small.roman.shape, np.float32)
-        oracle.add_image(plane, exptime=1.0, pixmap=whole, weight_map=plane, pixfrac=one.pixfrac, in_units="cps")
+        oracle.add_image(plane, exptime=1.0, pixmap=whole, weight_map=plane, pixfrac=result.pixfrac, in_units="cps")
     weight = oracle.out_wht[2:-2, 2:-2]
-    assert one.uneven == pytest.approx(weight.std() / np.median(weight), rel=0.05)
-    assert one.empty == pytest.approx((weight <= 0).mean(), abs=2e-3)
-    assert advice(found) is None or advice(found) in CHOICES
-    good = [replace(one, empty=0.0, uneven=0.3 if one.pixfrac < 0.6 else 0.1) for one in found]
+    assert result.uneven == pytest.approx(weight.std() / np.median(weight), rel=0.05)
+    assert result.empty == pytest.approx((weight <= 0).mean(), abs=2e-3)
+    assert advice(results) is None or advice(results) in CHOICES
+    good = [replace(result, empty=0.0, uneven=0.3 if result.pixfrac < 0.6 else 0.1) for result in results]
     assert advice(good) == 0.6
     with pytest.raises(UserError, match="no Roman"):
-        coverage(replace(product, maker=replace(product.maker, exposures=exposures_of_rubin(small))))
+        coverage(replace(product, maker=replace(product.maker, exposures=exposures_for_drawn_coadds(small))))
 
 
 def test_an_image_elsewhere_has_no_strips(small):
@@ -208,7 +207,7 @@ def test_an_image_elsewhere_has_no_strips(small):
 
 @pytest.mark.parametrize("pixels", [1000, 1907, 2345, 3400])
 def test_strips_cover_the_part_without_slivers(pixels):
-    """A strip of a row is what would be left of 1025 rows in strips of 512."""
+    """Strips of exactly 512 rows would leave a strip of one row of 1025 rows."""
     exposure = Exposure(visit=0, detector=9, band="H158", mjd=61541.0, exptime=139.8, ra=53.0, dec=-40.0, pa=120.0)
     source = WCS(Roman(RomanSettings()).header(exposure))
     ra, dec = source.all_pix2world(2044, 3000, 0)
@@ -242,7 +241,7 @@ def test_stack_counts_and_variances():
 
 
 def test_hundreds_of_exposures_are_counted():
-    """A deep field has more than a byte can count."""
+    """A deep field has more exposures than fit in a byte."""
     square = np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]])
     layers = stack(np.stack([square] * 300), np.ones(300), np.ones(300), (40, 40))
     assert layers.count[20, 20] == 300

@@ -1,6 +1,7 @@
-"""PSFs of drizzled coadds: against GalSim's stars drizzled by the package, and against the mean over many dithers."""
+"""PSFs of drizzled coadds, compared with GalSim stars drizzled by the drizzle package and with means over dithers."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import galsim
 import numpy as np
@@ -9,8 +10,6 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy.special import erf
 
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map
@@ -20,27 +19,27 @@ from romandask.stages.coadds.psf_at import coadd_psf
 from romandask.stages.psf_images import flat_shares
 
 TURN = 1.9 * np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
-"""Tile pixels a native pixel."""
+"""Jacobian of the map from native pixels to tile pixels: 1.9 tile pixels per native pixel, rotated by 0.5 rad."""
 
 
 def gaussian(sigma: float, oversampling: int = 8, side: int = 64) -> np.ndarray:
-    """Return a Gaussian star with the response of native pixels, `oversampling` samples a pixel."""
+    """Return a Gaussian star convolved with native pixels, with `oversampling` samples per pixel."""
     offset = (np.arange(side * oversampling) - side * oversampling // 2) / oversampling
     ends = [erf((offset + half) / (sigma * np.sqrt(2))) / 2 for half in (0.5, -0.5)]
     return np.outer(ends[0] - ends[1], ends[0] - ends[1])
 
 
-def test_a_drizzled_psf_is_the_mean_over_all_places_in_a_pixel():
-    fine, half, places = gaussian(0.6), 12, 24
+def test_a_drizzled_psf_is_the_mean_over_all_positions_in_a_pixel():
+    fine, half, steps = gaussian(0.6), 12, 24
     sums = Sums((31, 31), 1, 0.7)
     knots = np.linspace(0, 2 * half, 4)
-    for k in range(places**2):
-        x, y = (k % places + 0.5) / places - 0.5, (k // places + 0.5) / places - 0.5
+    for k in range(steps**2):
+        x, y = (k % steps + 0.5) / steps - 0.5, (k // steps + 0.5) / steps - 0.5
         u, v = np.meshgrid(knots - half - x, knots - half - y)
-        there = np.stack([TURN[0, 0] * u + TURN[0, 1] * v + 15, TURN[1, 0] * u + TURN[1, 1] * v + 15])
+        on_tile = np.stack([TURN[0, 0] * u + TURN[0, 1] * v + 15, TURN[1, 0] * u + TURN[1, 1] * v + 15])
         rows = slice(0, 2 * half + 1)
         star = native_star(fine, 8, half, x, y) / np.linalg.det(TURN)
-        sums.add([([star], np.ones(star.shape, np.float32), PixelMap(rows, rows, knots, knots, there))])
+        sums.add([([star], np.ones(star.shape, np.float32), PixelMap(rows, rows, knots, knots, on_tile))])
     found = drizzled_psf(fine, 8, TURN, 0.7, 31)
     assert found.sum() == pytest.approx(1, abs=1e-3)
     np.testing.assert_allclose(found, sums.means()[0], atol=2e-3 * found.max())
@@ -52,13 +51,13 @@ def test_a_finer_step_samples_the_same_psf():
     np.testing.assert_allclose(half[::2, ::2], coarse, atol=1e-6)
 
 
-@pytest.mark.parametrize("place", [(0.5, 0.5), (0.3, 0.62)])
-def test_a_star_of_a_coadd_is_galsims_drizzled(small, place):
-    """GalSim draws the star on every exposure, the package drizzles them: nothing of it is ours but the map."""
+@pytest.mark.parametrize("position", [(0.5, 0.5), (0.3, 0.62)])
+def test_a_star_on_a_coadd_equals_drizzled_galsim_stars(small, position):
+    """GalSim draws the star on each exposure, and the drizzle package combines them with romandask's pixel maps."""
     product = coadds(small.product, small.tiles, small.settings)
     box = small.region
-    ra = box.ra_min + place[0] * (box.ra_max - box.ra_min)
-    dec = box.dec_min + place[1] * (box.dec_max - box.dec_min)
+    ra = box.ra_min + position[0] * (box.ra_max - box.ra_min)
+    dec = box.dec_min + position[1] * (box.dec_max - box.dec_min)
     found = coadd_psf(product, ra, dec, "H158", stamp=41)
     tile = next(tile for tile in small.tiles if tile.name == found.attrs["tile"])
     header = tile.header(product.make.pixels, small.roman.coadd_scale)
@@ -79,14 +78,16 @@ def test_a_star_of_a_coadd_is_galsims_drizzled(small, place):
             shifted = profile.shift((sx - column) * scale, (sy - row) * scale) * share
             shifted.drawImage(image=star, add_to_image=True)
         rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-        places = pixel_map(source, wide, rows, columns).dense()
+        on_tile = pixel_map(source, wide, rows, columns).dense()
         area = abs(
-            np.linalg.det([places[half, half + 1] - places[half, half], places[half + 1, half] - places[half, half]])
+            np.linalg.det(
+                [on_tile[half, half + 1] - on_tile[half, half], on_tile[half + 1, half] - on_tile[half, half]]
+            )
         )
         oracle.add_image(
             (star.array / area).astype(np.float32),
             exptime=1.0,
-            pixmap=places,
+            pixmap=on_tile,
             pixfrac=0.7,
             in_units="cps",
             weight_map=np.full(star.array.shape, exposure.exptime, np.float32),
@@ -110,7 +111,7 @@ def test_a_redder_star_is_wider(small):
         assert image.attrs["x"] == image.attrs["y"] == 30
 
 
-def test_places_and_bands_that_are_not_there_are_told(small):
+def test_missing_positions_and_bands_are_reported(small):
     product = coadds(small.product, small.tiles, small.settings)
     ra, dec = small.region.centre
     with pytest.raises(UserError, match=r"band 'K213': this survey has H158"):
@@ -119,7 +120,7 @@ def test_places_and_bands_that_are_not_there_are_told(small):
         coadd_psf(product, 10.0, 10.0, "H158")
     with pytest.raises(UserError, match="none negative"):
         coadd_psf(product, ra, dec, "H158", spectrum=lambda wave: -wave)
-    rubin = Rubin(RubinSettings(bands=("i",)), n_waves=3)
-    exposures = replace(small.product, renderer=replace(small.product.renderer, instrument=rubin))
+    renderer = replace(small.product.renderer, instrument=SimpleNamespace(coadd="draw"))
+    exposures = replace(small.product, renderer=renderer)
     with pytest.raises(UserError, match="only for drizzled coadds"):
-        coadd_psf(replace(product, maker=replace(product.maker, exposures=exposures)), ra, dec, "i")
+        coadd_psf(replace(product, maker=replace(product.maker, exposures=exposures)), ra, dec, "H158")

@@ -1,4 +1,4 @@
-"""Truth catalogs: the generator and source catalogs as HATS collections, and the files that leave them."""
+"""Truth catalogs: generated or from source catalogs, as HATS collections and as exported files."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def sample(shared, **settings):
 
 
 def stored(product, store):
-    """The product with all its units and HATS files in a store."""
+    """Return the product after all its units and HATS files have been stored."""
     tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
     outcomes = list(InProcess().run(Batch(product, tasks, store)))
     assert all(outcome.record for outcome in outcomes), [outcome.failure for outcome in outcomes]
@@ -61,7 +61,7 @@ def stored(product, store):
 
 
 def plain(frame):
-    """Rows in the order of their ids, without the columns of top-hat spectra."""
+    """Return rows sorted by id, without the columns of top-hat spectra."""
     key = "galaxy_id" if "galaxy_id" in frame else "id"
     columns = [name for name in frame if not name.startswith("sed_val")]
     return frame.sort_values(key, ignore_index=True)[columns]
@@ -76,8 +76,8 @@ def test_rows_do_not_depend_on_partitions():
     assert not set(coarse.stars.all_rows()["id"]) & set(coarse.galaxies.all_rows()["galaxy_id"])
 
 
-def test_a_part_of_the_universe_is_that_part():
-    """A smaller region has the rows that the larger one has there: edges are no edges of the universe."""
+def test_a_smaller_region_has_the_same_rows_as_a_larger_one():
+    """The edge of a region has no effect on the rows inside it."""
     small = Region(53.01, 53.03, -40.02, -40.01)
     settings = TruthSettings(order=11, margin=0.0, nside=64)
     inner = plain(truth(settings, Path("."), small, BANDS, 7).galaxies.all_rows())
@@ -180,7 +180,7 @@ def test_the_real_sample_reads_with_its_inf_and_nan(shared):
 
 
 def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
-    """Fluxes of the published files (other throughputs): the same objects, the same colours to their scatter."""
+    """The published fluxes have other throughputs: the colours of the same objects agree within their scatter."""
     both = sample(shared).galaxies.all_rows()
     both = both[(both["lsst_flux_r"] > 1e-6) & (both["flux_r"] > 0)]
     assert len(both) > 200
@@ -190,7 +190,7 @@ def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
 
 
 def test_a_source_is_read_once(tmp_path, shared, monkeypatch):
-    """What truth there is its rows tell, those in the store: not a second pass over the files."""
+    """Cells and spectra are found from the stored rows, without a second pass over the files."""
     read, batch = [], _ReadBatch.__call__
 
     def counted(maker, index):
@@ -241,7 +241,7 @@ def test_every_row_of_a_source_is_out_or_in_quarantine(shared, tmp_path, setting
 
 
 def test_an_instance_catalogs_fluxes_are_galsims(shared, tmp_path):
-    """Star and galaxy of the real file against GalSim: SED file, magnorm, redshift; dust is small but there."""
+    """Fluxes of stars in the real file are compared with GalSim, from SED file and magnorm; there is a little dust."""
     _, survey = ingested(
         tmp_path, shared, {"source": "instance_catalog", "path": "dc2_instance_catalog/example_instance_catalog.txt"}
     )
@@ -281,7 +281,7 @@ def test_a_table_with_a_map_of_its_columns(shared, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "rows in 50 = rows out 48 + quarantined 2" in done.stdout
     frame = pd.read_parquet(tmp_path / "s/truth/galaxies/catalog/dataset")
-    # of flat f_nu the photon density is that of 500 nm / (1 + z) wherever one looks
+    # for flat f_nu, magnorm at 500 nm in the rest frame fixes the flux in every band, up to the factor 1 + z
     expected = 24.0 - 2.5 * np.log10(1 + frame["redshift"])
     np.testing.assert_allclose(31.4 - 2.5 * np.log10(frame["flux_H158"]), expected, atol=2e-3)
     reasons = pd.read_parquet(tmp_path / "s/truth/quarantine")["reason"]

@@ -1,4 +1,4 @@
-"""Whatever numbers a catalog holds and whatever a setting is: used, or set aside or refused with its reason."""
+"""Property tests: any value in a catalog is used or quarantined with a reason, and any setting is used or refused."""
 
 import warnings
 from contextlib import suppress
@@ -51,7 +51,7 @@ PIPELINE = yaml.safe_load((ROOT / "pipelines" / "tiny.yaml").read_text())
 
 
 def catalogs(good, spectra):
-    """Tables of up to ten good rows, in each of which up to two values are any number; some ids are there twice."""
+    """Return tables of up to ten good rows with up to two arbitrary numbers in each; some ids occur twice."""
     odd = st.dictionaries(st.sampled_from(sorted(good)), NUMBERS, max_size=2)
     row = st.builds(
         lambda found, names, number: {**good, **found, **names, "id": number},
@@ -71,27 +71,27 @@ def folder(tmp_path_factory):
 
 
 def read(folder, kind, content):
-    """Rows of a table as they come out, and those of the region that were not set aside."""
+    """Return the rows of the truth catalog of a table, and the input rows in the region that were not quarantined."""
     frame = pd.DataFrame(content)
     frame.to_parquet(folder / f"{kind}.parquet")
     table = {"path": f"{kind}.parquet", "columns": {name: name for name in frame}}
     asked = TruthSettings(source="table", order=6, seds=".", **{f"{kind}_table": table})
     with warnings.catch_warnings():
-        # of an overflow, say
+        # an overflow, for example, is an error
         warnings.simplefilter("error")
         found = truth(asked, folder, REGION, BANDS, 1)
         product = found.galaxies if kind == "galaxy" else found.stars
         parts = [product.make(k) for k in range(len(product.units))]
-        aside = pd.concat([found.quarantine.make(k) for k in range(len(found.quarantine.units))])
-    assert (aside["reason"] != "").all()
-    assert not aside["row"].duplicated().any()
-    good = frame.drop(frame.index[aside["row"].to_numpy(int)])
+        quarantined = pd.concat([found.quarantine.make(k) for k in range(len(found.quarantine.units))])
+    assert (quarantined["reason"] != "").all()
+    assert not quarantined["row"].duplicated().any()
+    good = frame.drop(frame.index[quarantined["row"].to_numpy(int)])
     expected = good[REGION.contains(good["ra"], good["dec"], asked.margin)]
     return pd.concat(parts) if parts else product.empty(), expected
 
 
 def check(out, expected):
-    """Everything that comes out is the rows that were good, and numbers that can be drawn."""
+    """Check that the catalog has exactly the good rows, and finite fluxes that are not negative."""
     assert out["n_rows"].sum() == len(expected)
     np.testing.assert_array_equal(np.sort(out["ra"]), np.sort(expected["ra"]))
     fluxes = out[[name for name in out if name.startswith("flux_")]].to_numpy(float)
@@ -118,7 +118,7 @@ def test_any_catalog_of_stars(folder, content):
 
 
 def paths(content, before=()):
-    """The keys of all settings, as paths."""
+    """Yield the keys of all settings, as paths."""
     for key, value in content.items():
         yield (*before, key)
         if isinstance(value, dict):
@@ -137,11 +137,11 @@ VALUES = st.recursive(
 def test_any_settings_are_taken_or_refused(folder, changes):
     content = yaml.safe_load(yaml.safe_dump(PIPELINE))
     for path, value in changes.items():
-        place = content
+        section = content
         for key in path[:-1]:
-            place = place[key] if isinstance(place, dict) else {}
+            section = section[key] if isinstance(section, dict) else {}
         with suppress(TypeError):
-            place[path[-1]] = value
+            section[path[-1]] = value
     (folder / "p.yaml").write_text(yaml.safe_dump(content))
     try:
         found = load_pipeline(folder / "p.yaml")

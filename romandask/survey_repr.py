@@ -140,7 +140,8 @@ def footprint_svg(survey: SurveyContext) -> str:
         shapes = "".join(f"<polygon points='{one}'/>" for one in points)
         return f"<g fill='{fill}' fill-opacity='{opacity:g}' stroke='{stroke}' stroke-width='{width}'>{shapes}</g>"
 
-    layers, legend = [], []
+    layers: list[str] = []
+    legend: list[str] = []
     for number, (name, corners) in enumerate(outlines.items()):
         colour = _COLOURS[number % len(_COLOURS)]
         # depth of the overlap, were the exposures spread over the map

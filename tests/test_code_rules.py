@@ -42,7 +42,7 @@ def imports_of(path: Path) -> list[str]:
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("romandask"):
-            found += [f"{node.module}.{name.name}" for name in node.names]
+            found += [f"{node.module}.{name.name}" for name in node.names if name.name != "__version__"]
         elif isinstance(node, ast.Import):
             found += [name.name for name in node.names if name.name.startswith("romandask")]
     return found

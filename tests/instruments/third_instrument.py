@@ -9,7 +9,9 @@ import pandas as pd
 from pydantic import AfterValidator
 
 from romandask.instruments.instrument import InstrumentContext, InstrumentSettings
-from romandask.instruments.rubin.rubin import AREA, Rubin, RubinPointings, RubinSettings
+from romandask.instruments.rubin.bands import COLLECTING_AREA
+from romandask.instruments.rubin.rubin import Rubin
+from romandask.instruments.rubin.settings import RubinPointings, RubinSettings
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.model.settings import one_of
 from romandask.model.sky import Region
@@ -34,11 +36,11 @@ class Third(Rubin):
 
     def bandpass(self, band: str) -> Bandpass:
         """Return LSST's r band under its own name."""
-        return replace(rubin_bandpass("r", self.n_waves, AREA), name="VIS")
+        return replace(rubin_bandpass("r", self.n_waves, COLLECTING_AREA), name="VIS")
 
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
         """Return the visits that Rubin would make in r."""
-        return Rubin(self.settings, self.n_waves).plan(region, seed).assign(band="VIS")
+        return Rubin(self.settings, n_waves=self.n_waves).plan(region, seed).assign(band="VIS")
 
 
 class ThirdSettings(InstrumentSettings):
@@ -52,7 +54,7 @@ class ThirdSettings(InstrumentSettings):
     def instrument(self, context: InstrumentContext) -> Third:
         """Return the telescope."""
         settings = RubinSettings(bands=("r",), pointings=self.pointings)
-        return Third(settings, context.n_waves, seed=context.seed)
+        return Third(settings, n_waves=context.n_waves, seed=context.seed)
 
 
 class WithThird(Pipeline):

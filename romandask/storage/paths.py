@@ -162,7 +162,7 @@ def file_names(folder: AnyPath, ending: str) -> list[str]:
             names = os.listdir(folder)
         else:
             names = [key.rsplit("/", 1)[-1] for key in folder.fs.ls(folder.path, detail=False)]
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
     return sorted(name.removesuffix(ending) for name in names if name.endswith(ending) and not name.startswith("."))
 

@@ -9,8 +9,8 @@ import yaml
 from pydantic import Field, model_validator
 
 from romandask.instruments.instrument import Instrument, InstrumentContext, InstrumentSettings
-from romandask.instruments.roman.settings import RomanSettings
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.roman.roman import RomanSettings
+from romandask.instruments.rubin.rubin import RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.model.settings import (

@@ -14,10 +14,8 @@ import pandas as pd
 import pytest
 
 from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.settings import CoaddSettings, RenderSettings, TruthSettings
 from romandask.model.sky import Region
 from romandask.stages.exposures.exposures import exposures

@@ -1,6 +1,7 @@
 """The code's own rules: linter, types, layers, and prose that names real things."""
 
 import ast
+import graphlib
 import json
 import os
 import re
@@ -60,6 +61,16 @@ def test_imports_point_down(path):
         assert other[0] == own[0] or ROOMS.index(other[0]) > ROOMS.index(own[0]), f"{path} imports {module}"
         if own[0] == other[0] == "kernels" and own[1] != other[1]:
             assert KERNELS.index(other[1]) > KERNELS.index(own[1]), f"{path} imports {module}"
+
+
+def test_no_modules_import_each_other():
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in modules()}
+
+    def module_of(name: str) -> str | None:
+        return name if name in names else name.rpartition(".")[0] if name.rpartition(".")[0] in names else None
+
+    graph = {name: {module_of(found) for found in imports_of(path)} - {None} for name, path in names.items()}
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the modules
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,8 @@ import numpy as np
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.calibration import calibrations
 from romandask.instruments.roman.calibration_source import CalibrationSource
-from romandask.instruments.roman.roman import Roman
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.instruments.roman.sca_readout import ScaReadout, trapped_table
-from romandask.instruments.roman.settings import RomanSettings
 from romandask.kernels.detectors import sca
 from romandask.kernels.detectors.brighter_fatter import brighter_fatter
 from romandask.kernels.detectors.sca_exposure import Planes, accumulate, calibrate, read_out

@@ -18,8 +18,7 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.model.tiles import tangent_header

@@ -18,8 +18,7 @@ import numpy as np
 import pandas as pd
 
 from romandask.instruments.exposure import Exposure, footprint
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.fourier import POINT
 from romandask.kernels.rendering.galsim_engine import object_profile

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.measurement.shear import signal_to_noise
 from romandask.model.settings import LensingSettings, TruthSettings
 from romandask.model.sky import Region

@@ -16,10 +16,8 @@ import pandas as pd
 import pyccl
 import treecorr
 
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.universe.structure import bias
 from romandask.model.cosmology import Cosmology
 from romandask.model.settings import TruthSettings

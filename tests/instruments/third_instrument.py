@@ -10,8 +10,7 @@ from pydantic import AfterValidator
 
 from romandask.instruments.instrument import InstrumentContext, InstrumentSettings
 from romandask.instruments.rubin.bands import COLLECTING_AREA
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinPointings, RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.model.settings import one_of
 from romandask.model.sky import Region

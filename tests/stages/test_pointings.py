@@ -10,12 +10,10 @@ from astropy.io import fits
 
 from romandask.ingest import obseq, opsim
 from romandask.instruments.exposure import exposure_of, footprint
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanPointings, RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanPointings, RomanSettings
 from romandask.instruments.roman.sun import best_roll
 from romandask.instruments.rubin.focal_plane import detector_centres
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinPointings, RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.settings import CoaddSettings
 from romandask.model.sky import Region, touching_pairs

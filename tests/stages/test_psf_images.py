@@ -7,9 +7,8 @@ import galsim.roman
 import numpy as np
 import pytest
 
-from romandask.instruments.roman.settings import RomanSettings
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.roman.roman import RomanSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.rendering.seeing import fried, kolmogorov_transfer, von_karman_transfer
 from romandask.stages.psf_images import OVERSAMPLING, PSF_IMAGE_PIXELS, flat_shares, psf_image, psfs
 

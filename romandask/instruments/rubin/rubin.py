@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Annotated, ClassVar, Literal
 
 import galsim
 import numpy as np
 import pandas as pd
+from pydantic import AfterValidator, Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
-from romandask.instruments.instrument import Publication
+from romandask.instruments.instrument import InstrumentContext, InstrumentSettings, PointingSettings, Publication
 from romandask.instruments.readout import Light, Readout
-from romandask.instruments.rubin.bands import COLLECTING_AREA, COLOUR_BAND, REFERENCE_BAND
+from romandask.instruments.rubin.bands import BANDS, COLLECTING_AREA, COLOUR_BAND, REFERENCE_BAND
 from romandask.instruments.rubin.cadence import cadence
 from romandask.instruments.rubin.ccd_readout import CcdReadout
 from romandask.instruments.rubin.focal_plane import CENTRES, DETECTOR_SHAPE, PIXEL_SCALE, corners, header_of
@@ -21,13 +22,10 @@ from romandask.instruments.rubin.psf import RubinPsf
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
 from romandask.kernels.universe.bandpasses import rubin_bandpass
+from romandask.model.settings import distinct, one_of
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
-
-if TYPE_CHECKING:
-    # settings.py imports this module, because the settings make the instrument
-    from romandask.instruments.rubin.settings import RubinSettings
 
 DARK_CURRENT = 0.2
 """Dark current, electrons per second and pixel."""
@@ -39,6 +37,10 @@ PUBLICATION = Publication(
     galaxies=6_831_656 / (1039 * 0.125**2),
     stars=159_575 / (1039 * 0.125**2),
 )
+
+
+Band = Annotated[str, AfterValidator(one_of(BANDS))]
+"""Name of a band."""
 
 
 @dataclass(frozen=True)
@@ -210,3 +212,44 @@ class Rubin:
     def coadd(self) -> Literal["draw", "warp"]:
         """Method of coaddition: "draw" with mode: coadd, "warp" with mode: visits."""
         return "draw" if self.settings.mode == "coadd" else "warp"
+
+
+class RubinPointings(PointingSettings):
+    """Source of Rubin's visits: an OpSim database, or a generated five-year cadence."""
+
+    source: Literal["cadence", "opsim"] = "cadence"
+    path: str | None = Field(None, description="OpSim SQLite file, below `data`")
+    start: float = Field(60980.0, description="first night of the cadence, MJD")
+    visits: dict[Band, Annotated[int, Field(ge=0, le=10_000)]] = Field(
+        {name: band.visits for name, band in BANDS.items()}, description="mean visits of a point, by band"
+    )
+    seeing: float = Field(0.6, gt=0, description="median atmospheric FWHM at 500 nm and zenith, arcsec")
+
+
+class RubinSettings(InstrumentSettings):
+    """The `rubin` section of a pipeline."""
+
+    every_band: ClassVar[tuple[str, ...]] = tuple(BANDS)
+    usual_reference_band: ClassVar[str] = REFERENCE_BAND
+    bands: Annotated[tuple[Band, ...], AfterValidator(distinct)] = Field(tuple(BANDS), min_length=1)
+    mode: Literal["coadd", "visits"] = Field(
+        "coadd", description="coadd: tiles are drawn directly; visits: each visit and detector, then warped and coadded"
+    )
+    sensor: Literal["ideal", "silicon"] = Field(
+        "ideal", description="silicon: bright objects go through GalSim's model of the CCD, photon by photon (visits)"
+    )
+    cosmic_rays: bool = Field(True, description="in visits")
+    pointings: RubinPointings = RubinPointings()
+    atmosphere: Literal["kolmogorov", "von_karman"] = "kolmogorov"
+    outer_scale: float = Field(25.0, gt=1, description="outer scale of von Karman turbulence, m")
+
+    @model_validator(mode="after")
+    def _every_band_visited(self) -> RubinSettings:
+        missing = [band for band in self.bands if band not in self.pointings.visits]
+        if missing and self.pointings.source == "cadence":
+            raise ValueError(f"pointings.visits has no entry for {', '.join(missing)}")
+        return self
+
+    def instrument(self, context: InstrumentContext) -> Rubin:
+        """Return Rubin with these settings."""
+        return Rubin(self, n_waves=context.n_waves, seed=context.seed)

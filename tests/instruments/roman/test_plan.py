@@ -19,8 +19,7 @@ from romandask.ingest import obseq
 from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.focal_plane import move, separations
 from romandask.instruments.roman.plan import DITHER, LONG_STEP, SHORT_STEP
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanPointings, RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanPointings, RomanSettings
 from romandask.instruments.roman.sun import best_roll, leads
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses
 from romandask.model.errors import UserError

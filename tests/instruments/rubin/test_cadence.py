@@ -15,8 +15,7 @@ from romandask.instruments.rubin import site_sky
 from romandask.instruments.rubin.bands import BANDS
 from romandask.instruments.rubin.cadence import BLOCK, near_fields
 from romandask.instruments.rubin.depth import coadd_depth, depth_map, effective_fwhm, visit_depth
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinPointings, RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings
 from romandask.kernels.rendering.psf import PsfModel, star_image
 from romandask.model.errors import UserError
 from romandask.model.sky import Region, covering_sums, unit_vectors

@@ -11,8 +11,7 @@ import sep
 
 from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.rubin.psf import DEGREE
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.coadding.warp import REACH
 from romandask.kernels.rendering.psf import place_grid
 from romandask.kernels.rendering.seeing import (

@@ -9,8 +9,7 @@ from astropy.wcs import WCS
 
 from romandask.ingest.spectra import galaxy_templates
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering import draw as render
 from romandask.kernels.rendering.draw import Scene, plan_stamps, stamp_sizes
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, knot_offset

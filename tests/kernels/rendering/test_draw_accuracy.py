@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from romandask.instruments.exposure import Exposure
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering.draw import Scene, draw, plan_stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
 from romandask.kernels.rendering.galsim_engine import component_profile, object_profile

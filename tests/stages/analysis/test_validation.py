@@ -7,8 +7,7 @@ import pytest
 from astropy import units as u
 from dust_extinction.parameter_averages import F19
 
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.universe.dust import Dust, extinction
 from romandask.report import figures
 from romandask.stages.analysis.validation import colours_of, depths, residuals, with_truth

@@ -13,8 +13,7 @@ from drizzle.resample import Drizzle
 from scipy import ndimage
 
 from romandask.instruments.exposure import Exposure, pixel_areas
-from romandask.instruments.roman.roman import Roman
-from romandask.instruments.roman.settings import RomanSettings
+from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.coadding.stack import stack

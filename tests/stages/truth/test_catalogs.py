@@ -21,8 +21,7 @@ from romandask.engine.clients import InProcess
 from romandask.engine.progress import Reporter
 from romandask.engine.task import Batch, Task
 from romandask.export.truth import export_truth
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Cone, Region, chord, unit_vectors

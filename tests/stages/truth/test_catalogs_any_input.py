@@ -11,8 +11,7 @@ from conftest import ROOT
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from romandask.instruments.rubin.rubin import Rubin
-from romandask.instruments.rubin.settings import RubinSettings
+from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -62,6 +63,12 @@ def _bytes(path: AnyPath) -> int:
     return bytes_below(path) if path.exists() else 0
 
 
+def _shown(root: AnyPath) -> str:
+    """Return the path of a store, relative to the working directory if it is below it."""
+    below = isinstance(root, Path) and root.is_relative_to(Path.cwd())
+    return str(root.relative_to(Path.cwd()) if below else root)
+
+
 def _size(number: int) -> str:
     """Return a number of bytes as text."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6)):
@@ -72,7 +79,7 @@ def _size(number: int) -> str:
 
 def text_of(survey: SurveyContext) -> str:
     """Return the survey as text: its name, where it is stored, and a line a stage."""
-    place = survey.store.root if survey.store else "not stored"
+    place = _shown(survey.store.root) if survey.store else "not stored"
     lines = [f"Survey {survey.pipeline.name} ({place})"]
     lines += [f"  {line.stage:24s} {line.units:6d} units {_size(line.bytes):>10s}" for line in stage_lines(survey)]
     return "\n".join(lines)
@@ -81,7 +88,7 @@ def text_of(survey: SurveyContext) -> str:
 def html_of(survey: SurveyContext) -> str:
     """Return the survey as HTML: the same, with a map of its region, tiles and exposures."""
     region, lines = survey.region, stage_lines(survey)
-    place = html.escape(str(survey.store.root) if survey.store else "not stored: products are made on demand")
+    place = html.escape(_shown(survey.store.root) if survey.store else "not stored: products are made on demand")
     about = [
         f"RA {region.ra_min:g} to {region.ra_max:g}, Dec {region.dec_min:g} to {region.dec_max:g} degrees, "
         f"{region.area:.2f} square arcminutes, {len(survey.tiles)} tiles"

@@ -4,13 +4,14 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 OUTPUT = Path(__file__).resolve().parent.parent / "_static" / "architecture.svg"
-WIDTH, HEIGHT = 980, 640
+WIDTH, HEIGHT = 980, 700
 FILL = {"entry": "#e8f1fa", "survey": "#e3f3e6", "work": "#fdf2dc", "base": "#f1ecf8", "run": "#ffffff"}
 STROKE = {"entry": "#3b78b5", "survey": "#3d8b4d", "work": "#b8862b", "base": "#7a5aa6", "run": "#5a6675"}
 LAYERS = (
     ("entry", (("cli", "commands"), ("report", "pages"), ("export", "other formats"))),
     ("entry", (("run", "drive a run, status"),)),
-    ("survey", (("stage_graph", "stages and plan"), ("survey", "products by name"))),
+    ("survey", (("survey", "products by name"), ("survey_repr", "text and HTML"))),
+    ("survey", (("stage_graph", "all stages in order"),)),
     ("survey", (("stages", "truth, exposures, coadds, detections, analysis"),)),
     ("work", (("pipeline", "settings"), ("ingest", "source catalogs"), ("instruments", "Roman, Rubin"))),
     ("work", (("engine", "what is stale, submission"), ("products", "lazy images and tables"))),

@@ -13,6 +13,8 @@ import pytest
 from conftest import MINI, ROOT, command
 from output_hashes import output_hashes
 
+pytestmark = pytest.mark.slow
+
 STAGES = (
     "truth/galaxies",
     "exposures/roman",

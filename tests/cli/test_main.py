@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 import romandask
 from romandask.cli.main import app
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("arguments", "words"),

@@ -23,6 +23,8 @@ from romandask.storage.manifest import digest
 from romandask.storage.store import Store, refuse_full
 from romandask.survey import open_survey
 
+pytestmark = pytest.mark.slow
+
 DAMAGED_FILES = 60
 """Minimum number of files that are damaged, one at a time."""
 

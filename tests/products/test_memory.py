@@ -14,6 +14,8 @@ from romandask.stage_graph import stage_products
 from romandask.storage.manifest import read_records
 from romandask.survey import open_survey
 
+pytestmark = pytest.mark.slow
+
 THIN = ("truth.galaxies=1", "truth.nside=64", "run.memory_limit=2.0")
 CASES = {
     "tile": (

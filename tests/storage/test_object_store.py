@@ -35,6 +35,8 @@ from romandask.storage.paths import (
 )
 from romandask.storage.store import Store
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def bucket(tmp_path_factory):

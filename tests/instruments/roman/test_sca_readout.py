@@ -30,6 +30,8 @@ from romandask.report import figures
 from romandask.storage.manifest import read_record
 from romandask.survey import open_survey
 
+pytestmark = pytest.mark.slow
+
 FULL = (
     *(text for text in MINI if not text.startswith("rubin")),
     "rubin=null",

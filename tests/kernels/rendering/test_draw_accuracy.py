@@ -16,6 +16,8 @@ from romandask.kernels.rendering.galsim_engine import component_profile, object_
 from romandask.model.settings import RenderSettings
 from romandask.stages.psf_images import flat_shares, psf_image
 
+pytestmark = pytest.mark.slow
+
 BANDS = ("Y106", "J129", "H158", "F184")
 ROMAN = Roman(RomanSettings())
 COLOURS = {"red": (0.05, 0.15, 0.2, 0.25, 0.35), "blue": (0.35, 0.25, 0.2, 0.15, 0.05)}

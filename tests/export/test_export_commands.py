@@ -19,7 +19,7 @@ COMMANDS = {
     "meds": ["STORE", "OUT", "--id", "--cone", "--band", "--size", "--catalog"],
     "moc": ["STORE", "OUT"],
     "obscore": ["STORE", "OUT"],
-    "obseq": ["PIPELINE", "OUT", "[KEY=VALUE]..."],
+    "obseq": ["PIPELINE", "OUT", "KEY=VALUE"],
     "page": ["STORE", "OUT"],
     "psf": ["STORE", "OUT", "--exposure"],
     "truth": ["STORE", "OUT"],

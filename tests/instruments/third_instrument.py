@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
+import numpy as np
 import pandas as pd
 from pydantic import AfterValidator
 
+from romandask.instruments.exposure import Exposure
 from romandask.instruments.instrument import InstrumentContext, InstrumentSettings
 from romandask.instruments.rubin.bands import COLLECTING_AREA
 from romandask.instruments.rubin.rubin import Rubin, RubinPointings, RubinSettings
+from romandask.kernels.rendering.psf import PsfModel
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.model.settings import one_of
 from romandask.model.sky import Region
@@ -36,6 +39,10 @@ class Third(Rubin):
     def bandpass(self, band: str) -> Bandpass:
         """Return LSST's r band under its own name."""
         return replace(rubin_bandpass("r", self.n_waves, COLLECTING_AREA), name="VIS")
+
+    def effective_psf(self, exposures: list[Exposure], weights: np.ndarray) -> PsfModel:
+        """Return Rubin's PSF in r."""
+        return super().effective_psf([replace(exposure, band="r") for exposure in exposures], weights)
 
     def plan(self, region: Region, seed: int) -> pd.DataFrame:
         """Return the visits that Rubin would make in r."""

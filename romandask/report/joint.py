@@ -33,34 +33,35 @@ def blends(survey: Survey) -> str:
     sample = "unflagged, with a true counterpart" if survey.pipeline.matches.sample == "clean" else "all objects"
     text = (
         f"<h2>Blends</h2><p>Friends of friends over {rows[0]} objects of {sharp} and {rows[1]} of {blended}: "
-        f"{sample}{', ' + html.escape(cuts) if cuts else ''}. An unrecognised blend is alone of {blended} in a group "
-        f"with two or more objects of {sharp}.</p>"
+        f"{sample}{', ' + html.escape(cuts) if cuts else ''}. An unrecognised blend is a group of one "
+        f"{blended} object and two or more {sharp} objects.</p>"
     )
     for length in lengths:
         counts = statistics.blends(length)
         if counts.size:
             text += image_of(
                 joint_figures.blend_matrix(counts, length),
-                f"Numbers of groups at a linking length of {length:g} arcsec. Rows: {sharp}, columns: {blended}.",
+                f"Number of groups by their numbers of {sharp} objects (rows) and {blended} objects (columns), for a "
+                f"linking length of {length:g} arcsec.",
             )
     tables = {length: statistics.unrecognised(length) for length in lengths}
     chance = {length: statistics.chance(length) for length in lengths}
     return (
         text
         + table_of(pd.DataFrame([_blend_row(survey, length, tables[length], chance[length]) for length in lengths]))
-        + "<p>Troxel et al. (2023): 20 to 30% of Rubin's detections are unrecognised blends; 12% of the groups have a "
-        "Rubin object and none of Roman, 95% of those within a magnitude of the limit. A blend is real where its Roman "
-        "objects are two or more true ones, the second with a twentieth of the light or more. By chance: the share of "
-        "Rubin objects that have a Roman one, or two, where all of Rubin's are moved.</p>"
+        + "<p>Troxel et al. (2023): 20 to 30% of the Rubin objects are unrecognised blends; 12% of the groups have "
+        "a Rubin object and no Roman object, and 95% of those are within a magnitude of the limit. A blend is real if "
+        "its Roman objects are two or more true objects and the second has a twentieth of the light or more. By "
+        "chance: the fraction of Rubin objects with one, or two, Roman objects after Rubin objects were shifted.</p>"
         + image_of(
             joint_figures.blend_fraction(tables, chance),
-            "Unrecognised blends against i magnitude; errors are binomial. Dotted: objects with any Roman object by "
-            "chance.",
+            "Fraction of unrecognised blends by i magnitude, with binomial errors. Dotted: fraction of Rubin objects "
+            "with a Roman object by chance.",
         )
         + image_of(
             joint_figures.blend_distributions(statistics.distributions(lengths[0])),
-            f"Rubin's objects alone of their survey in a group ({lengths[0]:g} arcsec), with one Roman object and with "
-            "more: colour to the brightest of them, and size.",
+            f"Rubin objects that are the only one in their group ({lengths[0]:g} arcsec), with one Roman object and "
+            "with more: colour relative to the brightest Roman object, and size.",
         )
     )
 
@@ -143,9 +144,9 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
     sharp, blended = (survey.instruments[key].title for key in (pair.sharp, pair.blended))
     return "<h2>One field in every band</h2>" + image_of(
         joint_figures.field(images, red_to_blue, FIELD_HALF_SIDE, marks),
-        f"The {2 * FIELD_HALF_SIDE:g} arcsec of tile {name} with the most unrecognised blends. Large circles: objects "
-        f"of {blended}, small ones: of {sharp}, both of the samples; red: one of {blended} that is two or more of "
-        f"{sharp} within {survey.pipeline.matches.linking_lengths[0]:g} arcsec.",
+        f"The field of {2 * FIELD_HALF_SIDE:g} arcsec in tile {name} with the most unrecognised blends. Large circles: "
+        f"sample of {blended}; small circles: sample of {sharp}; red: {blended} objects with two or more {sharp} "
+        f"objects in their group (linking length {survey.pipeline.matches.linking_lengths[0]:g} arcsec).",
     )
 
 
@@ -211,17 +212,19 @@ def difference_images(survey: Survey) -> str:
     }
     offset = np.hypot(table["dx"], table["dy"])
     text = (
-        f"<p>{len(table)} objects of S/N above {settings.min_snr:g}: median shifts {table['dx'].median():+.4f} and "
-        f"{table['dy'].median():+.4f} pixels of {instrument.coadd_scale:g} arcsec, half of all within "
-        f"{offset.median():.3f}; scatter of the light that is left {1.4826 * np.median(np.abs(table['share'])):.1%} of "
-        f"theirs, for their colours; pixels over their rms: {1.4826 * np.median(np.abs(sigma)):.3f}.</p>"
+        f"<p>{len(table)} objects with S/N above {settings.min_snr:g}: median offsets {table['dx'].median():+.4f} and "
+        f"{table['dy'].median():+.4f} pixels of {instrument.coadd_scale:g} arcsec, median distance "
+        f"{offset.median():.3f}. Scatter of the residual flux: {1.4826 * np.median(np.abs(table['share'])):.1%} of the "
+        "flux, because objects differ in colour. Scatter of the difference over its rms: "
+        f"{1.4826 * np.median(np.abs(sigma)):.3f}.</p>"
     )
     return (
         "<h2>Difference images</h2>"
         + text
         + image_of(
             joint_figures.difference(images, sigma, table),
-            f"The middle of tile {survey.tiles[tile].name}: {settings.science}, {settings.template} with its PSF, "
-            "and the difference; and by how much objects are off their places. The circle is a tenth of a pixel.",
+            f"The middle of tile {survey.tiles[tile].name}: {settings.science}, {settings.template} convolved "
+            f"to the PSF of {settings.science}, and the difference; and the offsets of objects between the two images. "
+            "The circle has a radius of a tenth of a pixel.",
         )
     )

@@ -92,9 +92,9 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         "<h2>The same sky</h2>"
         + image_of(
             pictures.colour_pair(pairs, circled),
-            f"Tile {label} as each survey sees it. Circles: objects that the tile owns.",
+            f"Tile {label} in the coadds of each survey. Circles: objects in the unique area of the tile.",
         )
-        + image_of(pictures.coverage_maps(layers), "Weight and number of exposures of the tile.")
+        + image_of(pictures.coverage_maps(layers), "Weight and number of exposures at each pixel of the tile.")
     )
 
 
@@ -110,8 +110,8 @@ def _detector(survey: Survey) -> str:
         index = next((row for row in range(len(table)) if len(earlier(table, row))), 0)
         text += "<h2>The detectors</h2>" + image_of(
             figures.effects(exposures.effects(index)),
-            f"What each effect of the detector does around the brightest star of exposure {exposures.names[index]}: "
-            "with it less without it, all else and the random numbers the same, in electrons.",
+            f"Effects of the detector around the brightest star of exposure {exposures.names[index]}: the image with "
+            "each effect minus the image without it, with the same random numbers, in electrons.",
         )
     return text
 
@@ -123,14 +123,17 @@ def _inputs(survey: Survey) -> str:
     bands = tuple(survey.bandpasses)
     references = [instrument.reference_band for instrument in survey.instruments.values()]
     shown = tuple(dict.fromkeys(band for band in (*references, bands[0], bands[-1])))[:4]
-    text = "<h2>The true universe and where it is looked at</h2>" + image_of(
+    text = "<h2>Truth and exposures</h2>" + image_of(
         figures.input_distributions(galaxies, stars, survey.region.area, shown),
-        f"{len(galaxies)} galaxies and {len(stars)} stars of the region, by component.",
+        f"Distributions of {len(galaxies)} galaxies and {len(stars)} stars of the region, and of galaxy components.",
     )
     for name, instrument in survey.instruments.items():
         table = survey.pointings(name)
         footprints = {band: corners_of(table[table["band"] == band]) for band in instrument.bands}
-        text += image_of(figures.exposure_maps(survey.region, footprints), f"Exposures of {name} over the region.")
+        text += image_of(
+            figures.exposure_maps(survey.region, footprints),
+            f"Number of {instrument.title} exposures over the region, by band.",
+        )
     return text
 
 
@@ -161,8 +164,8 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
         + _comparison_with_paper(survey, objects, joined, depth)
         + image_of(
             figures.magnitude_histograms(true, measured, depth),
-            "Magnitudes: all true objects of the region, and Kron magnitudes of the detected. The lines are the "
-            "5-sigma depths of point sources.",
+            "Magnitudes of all true objects of the region, and Kron magnitudes of the detected objects. Lines: 5-sigma "
+            "depths of point sources.",
         )
         + (
             image_of(
@@ -174,12 +177,12 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
         )
         + image_of(
             figures.size_magnitude(objects, middle),
-            "Size and magnitude; point sources form the locus at the PSF's size.",
+            "Size against magnitude; point sources lie at the size of the PSF.",
         )
         + image_of(
             figures.residuals(residual_tables),
-            "Kron magnitudes less the true ones, by true magnitude: median and scatter; fluxes less the true ones over "
-            "their errors (pulls), median and scatter; and the share of objects that are flagged.",
+            "Residuals by true magnitude: Kron minus true magnitude (median and scatter), pulls of the fluxes "
+            "(residual over error, median and scatter), and the fraction of flagged objects.",
         )
         + image_of(
             figures.completeness(
@@ -187,8 +190,8 @@ def _measurements(survey: Survey, objects: dict[str, pd.DataFrame]) -> str:
                 matched,
                 {name: instrument.reference_band for name, instrument in survey.instruments.items()},
             ),
-            "Objects against the truth: the share of true objects that was found, in true magnitudes, the share of "
-            "objects that are real, in measured ones; Kron magnitudes less those of the counterparts, stars in red.",
+            "Completeness by true magnitude, purity by measured magnitude, and Kron magnitudes minus those of the true "
+            "counterparts; stars are red.",
         )
     )
 
@@ -243,8 +246,8 @@ def _lensing(survey: Survey) -> str:
         + "<p>Troxel et al. (2023), the whole survey: 69 galaxies a square arcminute, 0.247, signal to noise 47.</p>"
         + image_of(
             figures.shear(tables),
-            "Two-point functions of the true shapes of detected galaxies, with the errors of the Gaussian covariance; "
-            "lines: what the input cosmology makes of the sample's redshifts.",
+            "Two-point functions of the true shapes of detected galaxies, with errors from the Gaussian covariance. "
+            "Lines: prediction of the input cosmology for the redshifts of the sample.",
         )
     )
 

@@ -103,6 +103,7 @@ def test_nothing_that_a_user_writes_can_become_code():
         assert not found, (path, found)
 
 
+@pytest.mark.slow
 def test_linear_algebra_has_one_thread_wherever_the_package_is():
     """Its sums are rounded otherwise with more, and so are pixels: not by an environment that is set too late alone."""
     code = "import numpy; import romandask, threadpoolctl, json; print(json.dumps(threadpoolctl.threadpool_info()))"
@@ -142,6 +143,7 @@ def test_the_formatter_changes_nothing():
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.slow
 def test_types_hold():
     command = [sys.executable, "-m", "mypy"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -41,6 +41,7 @@ class FailingMaker:
         return pd.DataFrame({"number": np.array([index], np.int64)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_units_that_depend_on_a_failed_unit_are_skipped_and_all_others_are_made(tmp_path, workers):
     maker = FailingMaker(tmp_path, (1,))
@@ -73,6 +74,7 @@ class SlowMaker:
         return pd.DataFrame({"process": np.array([os.getpid()], np.int64)})
 
 
+@pytest.mark.slow
 def test_the_last_of_a_few_long_units_goes_to_a_free_worker(tmp_path):
     """Of three units on two workers, the third goes to the worker that is free first, whatever dask has timed."""
     units = tuple(Unit(f"u{k}", k) for k in range(3))
@@ -138,6 +140,7 @@ def test_workers_that_die_during_their_start_are_started_again(monkeypatch):
     assert starts == [1, 1]
 
 
+@pytest.mark.slow
 def test_lost_local_workers_are_started_again(tmp_path):
     """dask does not restart a worker that dies while its nanny starts it."""
     units = tuple(Unit(f"u{k}", k) for k in range(3))

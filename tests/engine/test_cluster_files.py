@@ -61,6 +61,7 @@ def queue(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_slurm_job_connects_over_tls_and_makes_identical_units(queue, tmp_path):
     """dask-jobqueue with slurm.yaml writes a job script, which is run and connects with its certificates."""
     pipeline = load_pipeline("tiny", list(MINI))

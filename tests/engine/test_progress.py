@@ -166,6 +166,7 @@ def test_a_store_is_in_use_while_the_process_of_its_lock_runs(tmp_path):
     assert not in_use(tmp_path)
 
 
+@pytest.mark.slow
 def test_watching_a_folder_that_is_no_store_is_refused(tmp_path):
     done = command("status", str(tmp_path), "--watch")
     assert done.returncode == 2

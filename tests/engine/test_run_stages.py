@@ -79,6 +79,7 @@ def logged_events(stages, folder, execution=None):
     return logged, this.summary
 
 
+@pytest.mark.slow
 def test_independent_stages_run_at_the_same_time(tmp_path):
     """The only coadd waits for a file that is created by a unit of the last stage."""
     flag = tmp_path / "flag"
@@ -213,6 +214,7 @@ def test_units_that_wait_for_prerequisites_leave_free_workers_to_a_later_stage(t
     assert sent == ["exposures"] * (1 + IN_FLIGHT_PER_THREAD * 2) + ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 1)
 
 
+@pytest.mark.slow
 def test_a_full_store_ends_the_run(tmp_path, monkeypatch):
     def full(error, store):
         raise UserError(f"{store.root}: no space left")
@@ -252,6 +254,7 @@ def test_catalog_metadata_without_checksums_is_written_again(tmp_path, monkeypat
     assert written == ["objects/x"] * 2
 
 
+@pytest.mark.slow
 def test_units_that_are_read_are_stored(tmp_path, monkeypatch):
     """A stage that starts too early would compute the units it reads itself, slowly and with unplanned memory."""
     pipeline = load_pipeline("tiny", [*MINI, "roman.detector=sca"])

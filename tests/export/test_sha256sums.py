@@ -99,6 +99,7 @@ def test_the_command_line_writes_and_verifies_checksums(tiny_store, tmp_path):
     assert command("verify", str(out), "--forget").returncode == 2
 
 
+@pytest.mark.slow
 def test_verify_of_a_store_with_exported_files_verifies_the_store(tmp_path):
     (tmp_path / "one.txt").write_text("1")
     sha256sums.note(tmp_path / "one.txt")

@@ -224,6 +224,7 @@ def test_included_files_are_read_and_missing_ones_are_reported(tmp_path):
         instance_catalog.open_source(tmp_path / "binary")
 
 
+@pytest.mark.slow
 def test_batches_of_a_large_file_have_a_bounded_number_of_rows(instances, tmp_path):
     lines = [line for line in instances.read_text().splitlines(keepends=True) if line.startswith("object")]
     path = tmp_path / "large.txt"

@@ -44,6 +44,7 @@ def made(tmp_path_factory):
     path.unlink()
 
 
+@pytest.mark.slow
 def test_files_have_the_extensions_of_table_1_in_order(made):
     check(made)
     assert check_files(made.parent) == [made]
@@ -68,6 +69,7 @@ def test_values_depend_only_on_the_seed_and_the_sca(made):
     assert (sca.gain(generator) != sca.gain(lambda name: rng(7, "calibration", 4, name))).all()
 
 
+@pytest.mark.slow
 def test_synthetic_detectors_have_the_statistics_of_real_ones(made):
     gain, well, bias = read(made, "GAIN"), read(made, "SATURATE"), read(made, "BIAS").astype(float)
     assert gain.mean() == pytest.approx(1.6, rel=0.02)
@@ -167,6 +169,7 @@ def generators(name, block):
     return rng(1, "exposures", name, block)
 
 
+@pytest.mark.slow
 def test_a_dark_exposure_has_the_moments_of_its_calibrations(planes, response):
     numbers, dq = expose(np.zeros((4088, 4088), np.float32), planes, response, generators)
     inner = (slice(4, -4), slice(4, -4))
@@ -187,6 +190,7 @@ def test_a_dark_exposure_has_the_moments_of_its_calibrations(planes, response):
     np.testing.assert_array_equal(again, numbers)
 
 
+@pytest.mark.slow
 def test_calibration_recovers_a_flat_and_its_variance(planes, response):
     light = np.full((4088, 4088), 185.0, np.float32)
     numbers, dq = expose(light, planes, response, generators)
@@ -207,6 +211,7 @@ def test_calibration_recovers_a_flat_and_its_variance(planes, response):
     assert np.median(change) == pytest.approx(2 * 139.8, rel=0.02)
 
 
+@pytest.mark.slow
 def test_fluxes_of_stars_agree_with_the_simple_detector(planes, response):
     """From 17 to 22 mag, to 0.3%, in apertures that contain the charge moved by the brighter-fatter effect."""
     side, sky = 32, 100.0
@@ -289,6 +294,7 @@ def test_make_files_checks_its_arguments_before_it_writes(tmp_path, monkeypatch)
     assert calibration_files.BY_NAME["CNL"].shape == (3, 4096, 4096)
 
 
+@pytest.mark.slow
 def test_errors_of_the_commands(tmp_path):
     done = command("calibration", "check", str(tmp_path))
     assert (done.returncode, done.stdout) == (2, "")

@@ -156,6 +156,7 @@ def test_an_exposure_has_raw_data_and_a_calibrated_image():
     assert 1.4826 * np.median(np.abs(pull)) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_warped_and_drawn_tiles_agree(both):
     """Weights, depth and PSF agree, positions within 0.02 arcsec and fluxes within their errors."""
     warped, drawn, tile = both
@@ -202,6 +203,7 @@ def test_noise_realisations_of_warped_tiles_are_correlated(both):
     assert ratio == pytest.approx(np.mean((weights**2).sum(axis=1)), rel=0.03)
 
 
+@pytest.mark.slow
 def test_silicon_model_broadens_bright_stars_and_keeps_their_flux():
     """Isolated stars just below saturation, in the same exposure with and without the silicon model."""
     made = {}

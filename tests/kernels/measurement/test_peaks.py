@@ -54,6 +54,7 @@ def test_the_signal_to_noise_agrees_with_that_of_a_psf_fit():
     assert noise[20:-20, 20:-20].std() == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_noise_alone_has_no_peaks_of_five_sigma_and_faint_stars_are_found():
     shape = (900, 900)
     noise = rng(2, "noise").normal(0, RMS, shape)

@@ -212,6 +212,7 @@ def test_objects_outside_the_image_contribute_light(psf_model):
     np.testing.assert_allclose(image[:60, :60], whole[64:124, 64:124], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_a_truth_row_agrees_with_galsim_in_spectra_lensing_and_wcs():
     """A redshifted, lensed galaxy of two components with different spectra, drawn by GalSim's chromatic classes."""
     roman = Roman(RomanSettings(psf_degree=0), n_waves=3)

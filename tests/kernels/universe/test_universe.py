@@ -88,6 +88,7 @@ def test_distances_and_growth_agree_with_ccl(ccl):
     np.testing.assert_allclose(COSMO.growth(z), pyccl.growth_factor(ccl, 1 / (1 + z)), rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_angular_power_of_matter_and_galaxies_agrees_with_theory(sky):
     for shell in (6, 15, 28):
         theory = shell_spectra(2 * NSIDE)[shell]
@@ -183,6 +184,7 @@ def test_redshifts_follow_their_distribution_inside_a_shell():
     assert z.mean() == pytest.approx(expected, rel=0.015)
 
 
+@pytest.mark.slow
 def test_counts_in_r_and_h_agree_with_surveys(patch):
     area = REGION.area
     # clustering changes the counts of one small patch by a few per cent

@@ -38,6 +38,7 @@ def power(sources):
     return convergence_power(BINS, sources)
 
 
+@pytest.mark.slow
 def test_the_power_spectrum_and_its_correlations_are_pyccls(sources, power):
     ccl = pyccl.Cosmology(
         Omega_c=COSMO.omega_m - COSMO.omega_b,
@@ -96,6 +97,7 @@ def test_shape_noise_alone_is_two_sigma_to_the_fourth_over_pairs():
     assert np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0
 
 
+@pytest.mark.slow
 def test_sample_variance_is_that_of_gaussian_fields(power):
     """The scatter of xi+ between periodic Gaussian fields without noise, averaged over annuli."""
     random = np.random.default_rng(7)
@@ -124,6 +126,7 @@ def test_sample_variance_is_that_of_gaussian_fields(power):
     assert measured[0, 1] == pytest.approx(expected[0, 1], rel=0.25)
 
 
+@pytest.mark.slow
 def test_shapes_without_lensing_have_the_errors_of_their_noise_and_a_shear_its_square():
     random = np.random.default_rng(11)
     region = Region(52.0, 54.0, -41.0, -39.5)

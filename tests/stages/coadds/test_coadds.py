@@ -253,6 +253,7 @@ def counted(small):
     return replace(small.product, product=replace(small.product.product, make=renderer), renderer=renderer)
 
 
+@pytest.mark.slow
 def test_a_lazy_corner_equals_the_stored_one_and_renders_only_what_it_needs(small, counted, tmp_path):
     product = coadds(counted, small.tiles, small.settings)
     store = Store(tmp_path)

@@ -66,6 +66,7 @@ def plain(frame):
     return frame.sort_values(key, ignore_index=True)[columns]
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_partitions():
     coarse, fine = made(8), made(11)
     for kind in ("galaxies", "stars"):
@@ -106,6 +107,7 @@ def test_stars_take_the_spectra_of_a_folder(shared):
         made(8, star_seds=str(shared / "opsim"))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pandas.errors.Pandas4Warning", "ignore:The default suffix behavior")
 def test_catalogs_are_hats_collections_that_lsdb_hats_pandas_and_pyarrow_read(tmp_path):
     catalogs, store = made(10, stars=60), Store(tmp_path)
@@ -167,6 +169,7 @@ def test_a_cone_reads_its_own_pixels_alone(tmp_path):
     assert set(frame.compute()["galaxy_id"]) == set(inside["galaxy_id"])
 
 
+@pytest.mark.slow
 def test_the_real_sample_reads_with_its_inf_and_nan(shared):
     catalogs = sample(shared)
     galaxies, stars, bad = (table.all_rows() for table in (catalogs.galaxies, catalogs.stars, catalogs.quarantine))
@@ -188,6 +191,7 @@ def test_colours_of_the_real_sample_are_those_that_skycatalogs_gives(shared):
         assert (ratio - ratio.median()).std() < 0.12
 
 
+@pytest.mark.slow
 def test_a_source_is_read_once(tmp_path, shared, monkeypatch):
     """Cells and spectra are found from the stored rows, without a second pass over the files."""
     read, batch = [], _ReadBatch.__call__
@@ -217,6 +221,7 @@ def ingested(tmp_path, shared, settings, seds="seds"):
     return counts, Survey(pipeline_of(content, "test"), store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "rows"),
     [
@@ -256,6 +261,7 @@ def test_an_instance_catalogs_fluxes_are_galsims(shared, tmp_path):
         assert row.dust_r == pytest.approx(0.86 * row.MW_av, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_table_with_a_map_of_its_columns(shared, tmp_path):
     galaxies = {
         "objid": np.arange(50),
@@ -298,6 +304,7 @@ def test_a_table_with_a_map_of_its_columns(shared, tmp_path):
     assert not (tmp_path / "u").exists()
 
 
+@pytest.mark.slow
 def test_truth_leaves_as_fits_and_hdf5(tmp_path, shared):
     _, survey = ingested(tmp_path, shared, {"source": "skycatalogs", "path": "skycatalogs_sample"})
     export_truth(survey, tmp_path / "out")
@@ -319,6 +326,7 @@ def test_truth_leaves_as_fits_and_hdf5(tmp_path, shared):
         export_truth(Survey(survey.pipeline, survey.store), tmp_path / "again")
 
 
+@pytest.mark.slow
 def test_a_missing_column_or_a_truncated_file_is_named(shared, tmp_path):
     folder = tmp_path / "s"
     folder.mkdir()

@@ -98,6 +98,7 @@ def check(out, expected):
     assert (fluxes >= 0).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(catalogs(GALAXY, ["disk_sed", "bulge_sed", "knots_sed"]))
 def test_any_catalog_of_galaxies(folder, content):

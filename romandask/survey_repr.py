@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from romandask.stage_graph import stage_products
+from romandask.stages.pointings import corners_of
 from romandask.stages.stage import SurveyContext
 from romandask.storage.paths import AnyPath, bytes_below
 from romandask.storage.store import Store
@@ -132,7 +133,7 @@ def footprint_svg(survey: SurveyContext) -> str:
     grid = survey.pipeline.coadds.grid()
     tiles = np.stack([tile.corners(grid.inner) for tile in survey.tiles])
     outlines = {
-        name: plane(survey.pointings(name).filter(regex=r"^(ra|dec)_\d$").to_numpy(float).reshape(-1, 4, 2))
+        name: plane(corners_of(survey.pointings(name)))
         for name in survey.instruments
         if survey.store is not None and survey.store.table(f"pointings/{name}", "all").exists()
     }

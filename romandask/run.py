@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -16,8 +15,8 @@ from rich.console import Console
 from romandask.engine.clients import Client, Runner, on_client
 from romandask.engine.event_log import Log, newest_event
 from romandask.engine.progress import Reporter
-from romandask.engine.run_stages import Run, RunnableStage, Summary, run_stages
-from romandask.engine.staleness import failed, find_stale
+from romandask.engine.run_stages import Run, Summary, run_stages
+from romandask.engine.staleness import StoredOutputs, failed, find_stale
 from romandask.engine.verify import Verified, forget, verify
 from romandask.model.errors import UserError
 from romandask.pipeline import Pipeline
@@ -30,6 +29,7 @@ from romandask.storage.manifest import read_records
 from romandask.storage.paths import AnyPath, parse_path, write_bytes
 from romandask.storage.store import Store, write_json
 from romandask.survey import Survey
+from romandask.survey_graph import ignore_stale_unit_lists, runnable, store_of
 
 PACKAGES = (
     "romandask",
@@ -105,7 +105,7 @@ def plan(survey: Survey) -> list[PlannedStage]:
         If a unit does not fit into the memory of a worker, or an input file cannot be used.
     """
     limit, products = survey.pipeline.run.memory_limit, stage_products(survey)
-    _ignore_stale_unit_lists(survey, products)
+    ignore_stale_unit_lists(survey, products)
     rows = []
     for declared in products:
         product = survey.product(declared.name)
@@ -189,7 +189,7 @@ def run_on(client: Client, pipeline: Pipeline, store: AnyPath | str, selection: 
     survey = Survey(pipeline, Store(parse_path(store)))
     plan(survey)
     runner = on_client(client, pipeline.run.memory_limit)
-    _store_of(survey).prepare()
+    store_of(survey).prepare()
     return run(survey, runner, Reporter(Console()), selection)
 
 
@@ -206,14 +206,14 @@ def explain(survey: Survey, selection: Selection | None = None, retry: bool = Fa
         As in `run`.
     """
     selected = (selection or Selection()).of(stage_products(survey))
-    _ignore_stale_unit_lists(survey, selected)
-    store, to_be_made = _store_of(survey), set[tuple[str, str]]()
+    ignore_stale_unit_lists(survey, selected)
+    stored, to_be_made = StoredOutputs(store_of(survey)), set[tuple[str, str]]()
     rows = []
     for declared in selected:
         product = survey.product(declared.name)
-        todo = find_stale(product, store, to_be_made, retry)
-        to_be_made |= {(product.stage, product.names[task.index]) for task in todo.tasks}
-        reasons = Counter(task.why for task in todo.tasks)
+        todo = find_stale(product, stored, to_be_made, retry)
+        to_be_made |= {(product.stage, name) for name in todo.tasks}
+        reasons = Counter(task.why for task in todo.tasks.values())
         reasons += Counter({"an input is missing": len(todo.blocked), "skipped after failure": len(todo.failed)})
         rows.append(
             ExplainedStage(
@@ -241,7 +241,7 @@ def ingest(survey: Survey, runner: Runner, reporter: Reporter) -> dict[str, int]
         run_stages(runnable(survey, selected), current_run)
     tables = [survey.output(name) for name in ("truth/galaxies", "truth/stars")]
     out = sum(int(table.column("n_rows").sum()) for table in tables)
-    quarantined = {row["stage"]: row["rows"] for row in run_figures(_store_of(survey))}.get("truth/quarantine", 0)
+    quarantined = {row["stage"]: row["rows"] for row in run_figures(store_of(survey))}.get("truth/quarantine", 0)
     counts = {"in": source_rows(survey.output("truth/ingested")), "out": out, "quarantined": quarantined}
     failures = current_run.summary.failed
     if failures or counts["in"] != counts["out"] + counts["quarantined"]:
@@ -251,7 +251,7 @@ def ingest(survey: Survey, runner: Runner, reporter: Reporter) -> dict[str, int]
 
 def status(survey: Survey) -> list[StageStatus]:
     """Return the number of units of every product: all units, those that are stored, and those that failed."""
-    store = _store_of(survey)
+    store = store_of(survey)
     products = stage_products(survey)
     done = {product.name: len(store.recorded(product.name)) for product in products}
     rows = []
@@ -272,17 +272,17 @@ def verify_store(survey: Survey, only: str | None = None) -> Iterator[Verified]:
     only : str, optional
         Name of one product; by default all are verified.
     """
-    yield from verify(runnable(survey, stage_products(survey)), _store_of(survey), only)
+    yield from verify(runnable(survey, stage_products(survey)), store_of(survey), only)
 
 
 def forget_damaged(survey: Survey, verified: Verified) -> None:
     """Remove the records of the damaged units of a product, so that the next run makes them again."""
-    forget(_store_of(survey), verified)
+    forget(store_of(survey), verified)
 
 
 def last_event(survey: Survey) -> str:
     """Return one line about the last event of the newest run of a store; empty if no run has been logged."""
-    event = newest_event(_store_of(survey).log)
+    event = newest_event(store_of(survey).log)
     if event is None:
         return ""
     templates = {
@@ -327,54 +327,18 @@ def stored_versions(store: Store) -> dict[str, str]:
     return json.loads((store.root / "versions.json").read_text())
 
 
-def runnable(survey: Survey, products: list[StageProduct]) -> list[RunnableStage]:
-    """Return products of a survey in the form in which the engine runs and verifies them."""
-    unit_lists = {name for product in products for name in product.known_after}
-    return [_runnable(survey, product, unit_lists) for product in products]
-
-
-def _runnable(survey: Survey, product: StageProduct, unit_lists: set[str]) -> RunnableStage:
-    """Return one product for the engine; `unit_lists` are the products that determine which units others have."""
-    stage = product.stage
-
-    def ended(made: int) -> None:
-        if product.name in unit_lists:
-            survey.use_stored(product.name)
-
-    finish = None if stage.finish is None else partial(stage.finish, survey, _store_of(survey))
-    return RunnableStage(
-        name=product.name,
-        product=lambda: survey.product(product.name),
-        reads=product.reads,
-        known_after=product.known_after,
-        sky=stage.sky,
-        finish=finish,
-        ended=ended,
-    )
-
-
-def _ignore_stale_unit_lists(survey: Survey, products: list[StageProduct]) -> None:
-    """Let a survey make, not read, the stale products that determine which units the given products have."""
-    if survey.store is None:
-        return
-    for name in sorted({name for product in products for name in product.known_after}):
-        todo = find_stale(survey.product(name), survey.store)
-        if todo.tasks or todo.failed:
-            survey.ignore_stored(name)
-
-
 @contextmanager
 def _running(
     survey: Survey, products: list[StageProduct], runner: Runner, reporter: Reporter, retry: bool
 ) -> Iterator[Run]:
     """Lock the store, write the settings and package versions, and log the start and the end of the run."""
-    store = _store_of(survey)
+    store = store_of(survey)
     with locked(store.root):
         versions = {name: version(name) for name in PACKAGES}
         write_bytes(store.pipeline, survey.pipeline.to_yaml().encode())
         write_json(store.root / "versions.json", versions)
         write_checksums(store, "store", [store.pipeline, store.root / "versions.json"])
-        _ignore_stale_unit_lists(survey, products)
+        ignore_stale_unit_lists(survey, products)
         current_run = Run(store, runner, reporter, Log(store.log), retry)
         current_run.log.write("run", pipeline=survey.pipeline.name, on=runner.description, versions=versions)
         end = "stopped"
@@ -386,9 +350,3 @@ def _running(
             summary = current_run.summary
             made, kept = sum(summary.made.values()), sum(summary.kept.values())
             current_run.log.write("end", how=end, made=made, kept=kept, failed=len(summary.failed))
-
-
-def _store_of(survey: Survey) -> Store:
-    if survey.store is None:
-        raise UserError("this survey has no store: open one with romandask.open, or run a pipeline with --store")
-    return survey.store

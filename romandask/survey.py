@@ -10,6 +10,7 @@ import dask.dataframe as dd
 import pandas as pd
 import xarray as xr
 
+from romandask.engine.graph import UnitGraph
 from romandask.instruments.instrument import Instrument
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region
@@ -31,6 +32,7 @@ from romandask.stages.pointings import visits
 from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
 from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 from romandask.storage.store import Store
+from romandask.survey_graph import unit_graph
 from romandask.survey_repr import html_of, text_of
 
 Value = TypeVar("Value")
@@ -389,6 +391,25 @@ class Survey:
 
     def _instrument(self, survey: str) -> Instrument:
         return _select(self.instruments, survey)
+
+    def graph(self, stages: Sequence[str] = (), region: Region | None = None) -> UnitGraph:
+        """Return the stale units as a lazy dask collection: a task for each unit, a layer for each stage.
+
+        `graph().compute()` makes and stores them on threads; inside a `distributed.Client`, on its cluster. The
+        command `romandask run` computes the same graph, with progress, log and failures set aside.
+
+        Parameters
+        ----------
+        stages : sequence of str
+            Names (`coadds/roman`) or kinds (`coadds`) of products; by default all.
+        region : Region, optional
+            Make only the units of tiles, exposures and partitions that touch this area, and what they are made from.
+        """
+        return unit_graph(self, stages, region)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # what has been built is built again where it is needed
+        return Survey, (self.pipeline, self.store)
 
     def __repr__(self) -> str:
         return text_of(self)

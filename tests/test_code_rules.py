@@ -23,6 +23,7 @@ ROOMS = (
     "run",
     "survey",
     "survey_repr",
+    "survey_graph",
     "stage_graph",
     "stages",
     "pipeline",

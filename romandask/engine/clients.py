@@ -11,9 +11,10 @@ import re
 import socket
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +22,12 @@ from typing import Any, Protocol
 
 import dask
 import yaml
-from distributed import Client, LocalCluster, performance_report
+from distributed import Client, KilledWorker, LocalCluster, performance_report
 
-from romandask.engine.submission import Submission, submit_units
-from romandask.engine.task import Batch, Outcome, make_unit, skipped_outcomes
-from romandask.engine.task_queue import TaskQueue
+from romandask.engine.graph import Key, StageUnits, UnitGraph, begin_stage
+from romandask.engine.lost_units import Lost, ReportingNanny, watched_workers
+from romandask.engine.staleness import Source
+from romandask.engine.task import UnitResult, make_unit
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.storage.paths import AnyPath, write_bytes
@@ -36,12 +38,21 @@ NO_WORKER_TIMEOUT = 60.0
 """Time that a run waits for a cluster without workers, s."""
 POLL_INTERVAL = 2.0
 """Time between two looks for new workers while no task ends, s."""
-NextBatches = Callable[[], Iterable[Batch]]
-"""Returns the batches that can start now; empty if there are none."""
+BATCH = 200
+"""Largest number of results that are fetched at a time."""
 
 
-def _no_batches() -> Iterable[Batch]:
-    return ()
+@dataclass(frozen=True)
+class Ended:
+    """End of a task: the result of its unit, or why there is none."""
+
+    source: Source
+    """Stage and name of the unit."""
+    result: UnitResult | None
+    failure: str = ""
+    """Why the unit was not made, usually a traceback."""
+    error: BaseException | None = None
+    """Exception of the last attempt, which may be that of an input."""
 
 
 class Runner(Protocol):
@@ -50,17 +61,8 @@ class Runner(Protocol):
     description: str
     """Text for the user, for example the address of the dashboard."""
 
-    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
-        """Make units and yield the outcome of each as soon as it is known.
-
-        Parameters
-        ----------
-        *batches : Batch
-            Units to make.
-        more : callable
-            Returns further batches. Called repeatedly, until it returns none, at the beginning and after each outcome
-            has been processed.
-        """
+    def run(self, graph: UnitGraph) -> Generator[Ended | Lost, None, None]:
+        """Make the units of a graph and yield the end of each as soon as it is known."""
 
     def recording(self, path: AnyPath) -> AbstractContextManager[Any]:
         """Return a context manager that writes a performance report of the cluster (HTML) to `path` when it exits."""
@@ -75,32 +77,35 @@ class InProcess:
         """Return a context manager that does nothing, because there is no cluster to report on."""
         return nullcontext()
 
-    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
-        """Make units, one stage after another, and yield the outcome of each. A failed unit is not tried again."""
-        pending = [*batches]
-        while True:
-            while new := [*more()]:
-                pending += new
-            if not pending:
-                return
-            pending.sort(key=lambda batch: batch.rank)
-            yield from _run_in_process(pending.pop(0))
+    def run(self, graph: UnitGraph) -> Generator[Ended | Lost, None, None]:
+        """Make units, one stage after another, and yield the end of each. A failed unit is not tried again."""
+        results: dict[Source, UnitResult] = {}
+        for stage in graph.stages:
+            product = begin_stage(stage.product, graph.store)
+            for name in _after_their_sources(product.stage, stage):
+                source, needed = (product.stage, name), stage.sources[name]
+                if any(other not in results for other in needed):
+                    yield Ended(source, None)
+                    continue
+                try:
+                    result = make_unit(product, stage.tasks[name], graph.store, *(results[other] for other in needed))
+                except Exception as error:
+                    yield Ended(source, None, traceback.format_exc(), error)
+                else:
+                    results[source] = result
+                    yield Ended(source, result)
 
 
-def _run_in_process(batch: Batch) -> Iterator[Outcome]:
-    # with equal costs, the queue is in the order of affinity keys and unit numbers
-    product, waiting = batch.product, TaskQueue([replace(task, cost=0.0) for task in batch.tasks])
-    while waiting:
-        task = waiting.next()
-        try:
-            yield Outcome(product.stage, task.index, make_unit(product, task, batch.store))
-        except Exception as error:
-            yield Outcome(product.stage, task.index, None, traceback.format_exc(), error)
-            yield from skipped_outcomes(product, task.index, waiting.give_up(task.index))
+def _after_their_sources(stage_name: str, stage: StageUnits) -> Iterator[str]:
+    """Return the names of the units of a stage, each after those of the same stage that it waits for."""
+    sorter: TopologicalSorter[str] = TopologicalSorter()
+    for name in stage.tasks:
+        sorter.add(name, *(other for source, other in stage.sources[name] if source == stage_name))
+    return iter(sorter.static_order())
 
 
 class OnCluster:
-    """Runner that makes units on a dask cluster, those of several stages at the same time.
+    """Runner that makes the units of a graph on a dask cluster.
 
     Parameters
     ----------
@@ -121,8 +126,8 @@ class OnCluster:
         """Return a context manager that writes dask's performance report: task stream, transfers and profiles."""
         return _recording(self._client, path)
 
-    def run(self, *batches: Batch, more: NextBatches = _no_batches) -> Generator[Outcome, None, None]:
-        """Make units and yield the outcome of each. A failed unit is tried up to three times.
+    def run(self, graph: UnitGraph) -> Generator[Ended | Lost, None, None]:
+        """Make units and yield the end of each. A failing unit is tried three times.
 
         Raises
         ------
@@ -130,43 +135,67 @@ class OnCluster:
             If the cluster has no worker for a minute.
         """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        submissions = [Submission(self._client, batch, ended.put) for batch in batches]
-        last_worker_seen = time.monotonic()
-        try:
-            while True:
-                # `more` may be slow: tasks are submitted between two calls of it
-                new = [Submission(self._client, batch, ended.put) for batch in more()]
-                submissions = sorted(filter(None, [*submissions, *new]), key=lambda one: one.batch.rank)
-                threads = self._threads()
-                last_worker_seen = time.monotonic() if threads else last_worker_seen
-                submit_units(submissions, threads)
-                if not submissions and not new:
-                    return
-                future = self._next_ended(ended, 0.0 if new else POLL_INTERVAL)
-                if future is not None:
-                    yield from next(one for one in submissions if future in one.in_flight).settle(future)
-                elif time.monotonic() - last_worker_seen > NO_WORKER_TIMEOUT:
-                    raise UserError(
-                        f"no worker has been left for {NO_WORKER_TIMEOUT:.0f} s: start workers, or look for what ends "
-                        "them (memory: raise run.memory_limit); the same command resumes"
-                    )
-        finally:
-            in_flight = [future for submission in submissions for future in submission.in_flight]
-            if in_flight:
-                self._client.cancel(in_flight, force=True)
+        sources = {graph.key((stage.product.stage, name)): (stage.product.stage, name) for stage, name in _units(graph)}
+        keys = [*sources]
+        with watched_workers(self._client, sources) as losses:
+            futures = dict(zip(keys, self._client.get(graph.high_level_graph(), keys, sync=False), strict=True))
+            try:
+                for future in futures.values():
+                    future.add_done_callback(ended.put)
+                last_worker_seen = time.monotonic()
+                while futures:
+                    batch = self._next_ended(ended)
+                    yield from self._ends(batch, sources)
+                    for future in batch:
+                        del futures[future.key]
+                        future.release()
+                    yield from losses.known()
+                    if batch or self._client.scheduler_info(n_workers=0)["n_workers"]:
+                        last_worker_seen = time.monotonic()
+                    elif time.monotonic() - last_worker_seen > NO_WORKER_TIMEOUT:
+                        raise UserError(
+                            f"no worker has been left for {NO_WORKER_TIMEOUT:.0f} s: start workers, or look for what "
+                            "ends them (memory: raise run.memory_limit); the same command resumes"
+                        )
+                yield from losses.known(wait=False)
+            finally:
+                if futures:
+                    self._client.cancel([*futures.values()], force=True)
 
-    def _threads(self) -> dict[str, int]:
-        """Return the number of threads of each worker, by address."""
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        return {address: worker["nthreads"] for address, worker in workers.items()}
-
-    def _next_ended(self, ended: queue.SimpleQueue[Any], timeout: float) -> Any | None:
-        """Return the future of the next task that ends, or None after `timeout` seconds."""
+    def _next_ended(self, ended: queue.SimpleQueue[Any]) -> list[Any]:
+        """Return the futures that have ended; wait up to `POLL_INTERVAL` for the first one."""
         try:
-            return ended.get(timeout=timeout)
+            batch = [ended.get(timeout=POLL_INTERVAL)]
         except queue.Empty:
             self._restart()
-            return None
+            return []
+        while len(batch) < BATCH and not ended.empty():
+            batch.append(ended.get())
+        return batch
+
+    def _ends(self, batch: list[Any], sources: dict[Key, Source]) -> Iterator[Ended]:
+        """Yield the ends of some futures; results are fetched together."""
+        finished = {future.key: future for future in batch if future.status == "finished"}
+        results = self._client.gather(finished, errors="skip") if finished else {}
+        for future in batch:
+            source = sources[future.key]
+            if future.key in results:
+                yield Ended(source, results[future.key])
+                continue
+            error = future.exception() if future.status == "error" else None
+            yield Ended(source, None, _failure_text(future, error), error)
+
+
+def _units(graph: UnitGraph) -> Iterator[tuple[StageUnits, str]]:
+    return ((stage, name) for stage in graph.stages for name in stage.tasks)
+
+
+def _failure_text(future: Any, error: BaseException | None) -> str:
+    if error is None:
+        return f"the task was {future.status}\n"
+    if isinstance(error, KilledWorker):
+        return f"its worker died {error.allowed_failures + 1} times, perhaps for want of memory\n{error}\n"
+    return "".join(traceback.format_exception(type(error), error, future.traceback()))
 
 
 @contextmanager
@@ -271,6 +300,7 @@ def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
+                worker_class=ReportingNanny,
                 host="127.0.0.1",
                 dashboard_address=f"127.0.0.1:{_free_port(8787)}",
                 memory_limit=memory_limit,

@@ -1,4 +1,4 @@
-"""Progress of a run: one bar per stage on a terminal, plain lines elsewhere."""
+"""Progress of a run: bars of the run and of its active stages on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 LINE_INTERVAL = 5.0
 """Minimum time between two plain lines of a stage, s."""
+TOTAL = "all stages"
+"""Name of the progress of the whole run."""
 MAX_SILENCE = 8.0
 """Time without output after which the current activity is printed again, s."""
 
@@ -52,6 +54,10 @@ class Pace:
     """Time during which units of this stage were made, s. Excludes the time when other stages had the workers."""
     last_end: float = 0.0
     """Time at which the last unit finished, s; 0 before the first one."""
+
+    def expect(self, units: int, cost: float) -> None:
+        """Add units to make, and the sum of their costs."""
+        self.units, self.cost = self.units + units, self.cost + cost
 
     def advance(self, cost: float, now: float, seconds: float = math.inf) -> None:
         """Count one more unit, which finished at the time `now` and took the wall time `seconds`."""
@@ -136,9 +142,12 @@ class Reporter:
 
 
 class Board(Protocol):
-    """Display of the progress of the active stages."""
+    """Display of the progress of a run and of its active stages."""
 
-    def begin(self, name: str, units: int, cost: float) -> Meter:
+    def expect(self, units: int, cost: float) -> None:
+        """Add units to those that the whole run makes, and the sum of their costs."""
+
+    def begin(self, name: str, units: int, cost: float, seconds: float = 0.0) -> Meter:
         """Show a stage until all its units are counted.
 
         Parameters
@@ -149,6 +158,8 @@ class Board(Protocol):
             Number of units to make.
         cost : float
             Total cost of these units.
+        seconds : float
+            Time since the first unit of the stage was begun, s.
         """
 
 
@@ -158,29 +169,54 @@ def busy(text: str) -> AbstractContextManager[None]:
 
 
 class _Bars:
-    """Display of one bar per active stage on a terminal."""
+    """Display of one bar per active stage and one of the whole run, on a terminal."""
 
     def __init__(self, reporter: Reporter, progress: Progress):
         self._reporter, self._progress = reporter, progress
+        self._total = Pace(units=0, cost=0.0, start=time.monotonic())
+        self._bar: TaskID | None = None
 
-    def begin(self, name: str, units: int, cost: float) -> Meter:
-        return _Bar(self._reporter, self._progress, name, Pace(units=units, cost=cost, start=time.monotonic()))
+    def expect(self, units: int, cost: float) -> None:
+        self._total.expect(units, cost)
+        if self._bar is None:
+            self._bar = self._progress.add_task(TOTAL, total=0.0, done=0, units=0, left="")
+        self._progress.update(self._bar, total=self._total.cost, units=self._total.units)
+
+    def begin(self, name: str, units: int, cost: float, seconds: float = 0.0) -> Meter:
+        return _Bar(self, name, Pace(units=units, cost=cost, start=time.monotonic() - seconds))
+
+    def advance_total(self, cost: float) -> None:
+        if self._bar is not None:
+            self._total.advance(cost, time.monotonic())
+            self._update(self._bar, self._total, cost)
+
+    def add(self, name: str, pace: Pace) -> TaskID:
+        """Add the bar of a stage."""
+        return self._progress.add_task(name, total=pace.cost, done=0, units=pace.units, left="")
+
+    def advance(self, bar: TaskID, name: str, pace: Pace, cost: float) -> None:
+        """Advance the bar of a stage, and remove it after the last unit."""
+        self._update(bar, pace, cost)
+        if pace.done == pace.units:
+            # one plain line replaces the bar of a finished stage, so that bars show active stages only
+            self._progress.remove_task(bar)
+            self._reporter.say(pace.text(name, time.monotonic()))
+        self.advance_total(cost)
+
+    def _update(self, bar: TaskID, pace: Pace, cost: float) -> None:
+        left = pace.seconds_left()
+        text = "" if left is None else f"{duration(left)} left"
+        self._progress.update(bar, advance=cost, done=pace.done, left=text)
 
 
 class _Bar:
-    def __init__(self, reporter: Reporter, progress: Progress, name: str, pace: Pace):
-        self._reporter, self._progress, self._name, self._pace = reporter, progress, name, pace
-        self._task = progress.add_task(name, total=pace.cost, done=0, units=pace.units, left="")
+    def __init__(self, bars: _Bars, name: str, pace: Pace):
+        self._bars, self._name, self._pace = bars, name, pace
+        self._bar = bars.add(name, pace)
 
     def advance(self, cost: float, seconds: float = math.inf) -> None:
         self._pace.advance(cost, time.monotonic(), seconds)
-        left = self._pace.seconds_left()
-        text = "" if left is None else f"{duration(left)} left"
-        self._progress.update(self._task, advance=cost, done=self._pace.done, left=text)
-        if self._pace.done == self._pace.units:
-            # one plain line replaces the bar of a finished stage, so that bars show active stages only
-            self._progress.remove_task(self._task)
-            self._reporter.say(self._pace.text(self._name, time.monotonic()))
+        self._bars.advance(self._bar, self._name, self._pace, cost)
 
 
 class _Lines:
@@ -189,27 +225,38 @@ class _Lines:
     def __init__(self, reporter: Reporter):
         self._reporter = reporter
         self._active: dict[str, Pace] = {}
+        self._total = Pace(units=0, cost=0.0, start=time.monotonic())
+        self._last_line = time.monotonic()
 
-    def begin(self, name: str, units: int, cost: float) -> Meter:
-        pace = self._active[name] = Pace(units=units, cost=cost, start=time.monotonic())
-        return _Line(self._reporter, name, pace, self._active)
+    def expect(self, units: int, cost: float) -> None:
+        self._total.expect(units, cost)
+
+    def begin(self, name: str, units: int, cost: float, seconds: float = 0.0) -> Meter:
+        self._active[name] = Pace(units=units, cost=cost, start=time.monotonic() - seconds)
+        return _Line(self, name)
 
     def text(self) -> str:
-        """Return one line for each active stage."""
-        return "\n".join(pace.text(name, time.monotonic()) for name, pace in self._active.copy().items())
+        """Return one line with the progress of the run and of each active stage."""
+        stages = ", ".join(f"{name} {pace.done}/{pace.units}" for name, pace in self._active.copy().items())
+        total = self._total.text(TOTAL, time.monotonic()) if self._total.units else ""
+        return ": ".join(filter(None, (total, stages)))
+
+    def advance(self, name: str, cost: float, seconds: float) -> None:
+        """Count a unit of a stage; print the stage after its last unit, and the progress of the run now and then."""
+        now, pace = time.monotonic(), self._active[name]
+        pace.advance(cost, now, seconds)
+        self._total.advance(cost, now)
+        if pace.done == pace.units:
+            del self._active[name]
+            self._reporter.say(pace.text(name, now))
+        elif now - self._last_line > LINE_INTERVAL:
+            self._last_line = now
+            self._reporter.say(self.text())
 
 
 class _Line:
-    def __init__(self, reporter: Reporter, name: str, pace: Pace, active: dict[str, Pace]):
-        self._reporter, self._name, self._pace, self._active = reporter, name, pace, active
-        self._last_line = pace.start
+    def __init__(self, lines: _Lines, name: str):
+        self._lines, self._name = lines, name
 
     def advance(self, cost: float, seconds: float = math.inf) -> None:
-        now = time.monotonic()
-        self._pace.advance(cost, now, seconds)
-        finished = self._pace.done == self._pace.units
-        if finished:
-            del self._active[self._name]
-        if finished or now - self._last_line > LINE_INTERVAL:
-            self._last_line = now
-            self._reporter.say(self._pace.text(self._name, now))
+        self._lines.advance(self._name, cost, seconds)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
-from dataclasses import dataclass, replace
+from collections.abc import Set
+from dataclasses import dataclass
 from importlib.metadata import version
 
-from romandask.engine.task import Task
-from romandask.products.images import ImageProduct
-from romandask.products.tables import TableProduct
+from romandask.engine.task import Product, Task, stale_reason
 from romandask.products.units import Unit
 from romandask.storage.manifest import Record, digest, read_records
 from romandask.storage.paths import AnyPath, file_names, read_files, remove, write_bytes
@@ -17,14 +15,18 @@ from romandask.storage.store import Store
 FAILED_BEFORE = "failed before"
 FAILURE_SUFFIX = ".failed"
 """Suffix of the files that hold the failure of a unit."""
+Source = tuple[str, str]
+"""Stage and name of a unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Staleness:
     """The units of a stage, grouped by what a run does with them."""
 
-    tasks: list[Task]
-    """Stale units (missing or outdated) that can be made."""
+    tasks: dict[str, Task]
+    """Tasks of the units that are stale (missing or outdated), or may become so, and can be made, by name."""
+    sources: dict[str, tuple[Source, ...]]
+    """Units that a task waits for because the run makes them, by name of the unit, in the order of `make_unit`."""
     kept: int
     """Number of units that are up to date."""
     blocked: list[str]
@@ -32,92 +34,128 @@ class Staleness:
     failed: list[str]
     """Names of units that are skipped: they failed in an earlier run, and their input hash has not changed since."""
     outdated: list[str]
-    """Names of units with a record that is no longer valid."""
+    """Names of blocked units with a record, which is no longer valid."""
+
+
+class StoredOutputs:
+    """Output hashes of the stored units of a store; the records of a stage are read once, when they are needed."""
+
+    def __init__(self, store: Store):
+        self.store = store
+        self._outputs: dict[str, dict[str, str]] = {}
+
+    def __call__(self, source: Source) -> str | None:
+        """Return the output hash of a unit; None if it is not stored."""
+        stage, name = source
+        if stage not in self._outputs:
+            records = read_records(self.store, stage)
+            self._outputs[stage] = {unit: record.output for unit, record in records if record}
+        return self._outputs[stage].get(name)
 
 
 def find_stale(
-    product: ImageProduct | TableProduct,
-    store: Store,
-    planned: Set[tuple[str, str]] = frozenset(),
-    retry: bool = False,
+    product: Product, stored: StoredOutputs, planned: Set[Source] = frozenset(), retry: bool = False
 ) -> Staleness:
     """Return the units of a stage, grouped by what a run would do with them. Nothing is changed.
+
+    A unit that reads one of the `planned` units may turn out to be up to date when that one is made again and does not
+    change; the task decides it.
 
     Parameters
     ----------
     product : ImageProduct or TableProduct
         Product of the stage.
-    store : Store
-        Store with the records.
+    stored : StoredOutputs
+        Output hashes of the units of the store.
     planned : set of (stage, unit)
-        Units of earlier stages that a run would make first; used to explain a run without making anything.
+        Units of earlier stages that the run makes first.
     retry : bool
         Make again the units that failed in an earlier run.
     """
-    outputs: dict[str, dict[str, str]] = {}
-
-    def output(source: tuple[str, str]) -> str | None:
-        if source in planned:
-            return "to be made"
-        stage, name = source
-        if stage not in outputs:
-            outputs[stage] = {unit: record.output for unit, record in read_records(store, stage) if record}
-        return outputs[stage].get(name)
-
-    records, failed_inputs = dict(read_records(store, product.stage)), failures(store, product.stage)
+    records = dict(read_records(stored.store, product.stage))
+    failed_inputs = failures(stored.store, product.stage)
     tasks: dict[str, Task] = {}
+    sources: dict[str, tuple[Source, ...]] = {}
     prerequisites: dict[str, tuple[str, ...]] = {}
     blocked: list[str] = []
     skipped: list[str] = []
-    outdated: list[str] = []
     kept = 0
     for index, unit in enumerate(product.units):
-        if any(output(source) is None for source in unit.inputs):
+        if any(source not in planned and stored(source) is None for source in unit.inputs):
             blocked.append(unit.name)
-            outdated += [unit.name] if unit.name in records else []
             continue
-        parts = _parts(unit, output)
-        inputs, record = digest(product.stage, parts), records.get(unit.name)
-        if record is not None and record.inputs == inputs:
+        parts, unknown = _hashes(unit, stored, planned)
+        record, failed_hash = records.get(unit.name), failed_inputs.get(unit.name, "")
+        input_hash = "" if unknown else digest(product.stage, parts)
+        if record is not None and record.inputs == input_hash:
             kept += 1
             continue
-        failed_before = failed_inputs.get(unit.name) == inputs
+        failed_before = bool(failed_hash) and failed_hash == input_hash
         if failed_before and not retry:
             skipped.append(unit.name)
             continue
-        why = FAILED_BEFORE if failed_before else _why(unit.name, records, parts)
-        outdated += [unit.name] if unit.name in records else []
-        tasks[unit.name] = Task(index, inputs, unit.cost, unit.affinity, parts=parts, why=why)
-        prerequisites[unit.name] = unit.prerequisites
+        tasks[unit.name] = Task(
+            index=index,
+            parts=parts,
+            unknown=tuple(unknown.items()),
+            cost=unit.cost,
+            why=FAILED_BEFORE if failed_before else _why(unit.name, records, parts | dict.fromkeys(unknown, "")),
+            failed_inputs="" if retry else failed_hash,
+        )
+        sources[unit.name] = tuple(
+            source for stage in unknown for source in _sources(unit) if source[0] == stage and source in planned
+        )
+        if unit.prerequisites:
+            prerequisites[unit.name] = unit.prerequisites
     without_prerequisites = _without_prerequisites(prerequisites, {*blocked, *skipped})
-    ready = [
-        replace(task, prerequisites=tuple(tasks[other].index for other in prerequisites[name] if other in tasks))
-        for name, task in tasks.items()
-        if name not in without_prerequisites
-    ]
+    for name in without_prerequisites:
+        del tasks[name], sources[name]
+    for name, others in prerequisites.items():
+        if name in tasks:
+            sources[name] += tuple((product.stage, other) for other in others if other in tasks)
+    blocked += sorted(without_prerequisites)
+    mean = sum(task.cost for task in tasks.values()) / max(1, len(tasks))
+    seconds = max(product.seconds_per_unit, 0.01) / max(mean, 1e-9)
     return Staleness(
-        tasks=ready,
+        tasks={name: _with_cost(task, task.cost * seconds) for name, task in tasks.items()},
+        sources=sources,
         kept=kept,
-        blocked=blocked + sorted(without_prerequisites),
+        blocked=blocked,
         failed=skipped,
-        outdated=outdated,
+        outdated=[name for name in blocked if name in records],
     )
 
 
-def remove_outdated_records(product: ImageProduct | TableProduct, store: Store, staleness: Staleness) -> None:
-    """Remove the records that are no longer valid."""
+def _with_cost(task: Task, cost: float) -> Task:
+    return Task(task.index, task.parts, task.unknown, cost, task.why, task.failed_inputs)
+
+
+def remove_outdated_records(product: Product, store: Store, staleness: Staleness) -> None:
+    """Remove the records that are no longer valid of units that cannot be made."""
     for name in staleness.outdated:
         remove(store.record(product.stage, name))
 
 
-def _parts(unit: Unit, output: Callable[[tuple[str, str]], str | None]) -> dict[str, str]:
-    """Return the parts of the input hash of a unit: settings, version, and the outputs it reads of each stage."""
+def _sources(unit: Unit) -> tuple[Source, ...]:
+    return (*unit.inputs, *unit.optional)
+
+
+def _hashes(
+    unit: Unit, stored: StoredOutputs, planned: Set[Source]
+) -> tuple[dict[str, str], dict[str, tuple[str | None, ...]]]:
+    """Return the parts of the input hash of a unit that are known, and the outputs of the stages that are not.
+
+    The parts are the settings, the version, and the outputs that the unit reads of each stage.
+    """
     outputs: dict[str, list[str | None]] = {}
-    for source in (*unit.inputs, *unit.optional):
-        outputs.setdefault(source[0], []).append(output(source))
-    return {"settings": digest(unit.settings), "version": version("romandask")} | {
-        stage: digest(hashes) for stage, hashes in outputs.items()
-    }
+    waiting: set[str] = set()
+    for source in _sources(unit):
+        if source in planned:
+            waiting.add(source[0])
+        outputs.setdefault(source[0], []).append(None if source in planned else stored(source) or "")
+    known = {stage: digest(hashes) for stage, hashes in outputs.items() if stage not in waiting}
+    parts = {"settings": digest(unit.settings), "version": version("romandask")} | known
+    return parts, {stage: tuple(outputs[stage]) for stage in outputs if stage in waiting}
 
 
 def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) -> str:
@@ -125,12 +163,7 @@ def _why(name: str, records: dict[str, Record | None], parts: dict[str, str]) ->
     record = records.get(name)
     if record is None:
         return "damaged record" if name in records else "not there"
-    if not record.parts:
-        return "made by an earlier version"
-    changed = sorted(key for key in {*record.parts, *parts} if record.parts.get(key) != parts.get(key))
-    if changed == ["version"]:
-        return f"made by version {record.parts.get('version')}"
-    return f"changed: {', '.join(changed)}"
+    return stale_reason(record, parts)
 
 
 def _without_prerequisites(prerequisites: dict[str, tuple[str, ...]], missing: set[str]) -> set[str]:
@@ -143,7 +176,7 @@ def _without_prerequisites(prerequisites: dict[str, tuple[str, ...]], missing: s
     return blocked
 
 
-def remove_stray_records(product: ImageProduct | TableProduct, store: Store, made: Set[str]) -> None:
+def remove_stray_records(product: Product, store: Store, made: Set[str]) -> None:
     """Remove the records and failures of units that a stage no longer has, and the failures of units to be made now.
 
     Parameters

@@ -13,12 +13,12 @@ import psutil
 import pyarrow as pa
 import pytest
 from distributed import Client, LocalCluster
+from romandask.engine.submission import ATTEMPTS
+from romandask.engine.task_queue import TaskQueue
 
 from romandask.engine import clients
 from romandask.engine.clients import runner
-from romandask.engine.submission import ATTEMPTS
 from romandask.engine.task import Batch, Task
-from romandask.engine.task_queue import TaskQueue
 from romandask.model.errors import UserError
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit

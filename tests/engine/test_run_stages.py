@@ -12,13 +12,13 @@ import pyarrow as pa
 import pytest
 from conftest import MINI
 from rich.console import Console
+from romandask.engine.submission import IN_FLIGHT_PER_THREAD, Submission, submit_units
 
 from romandask import run as running
 from romandask.engine.clients import InProcess, runner
 from romandask.engine.event_log import Log, events
 from romandask.engine.progress import Reporter
 from romandask.engine.run_stages import Run, RunnableStage, run_stages
-from romandask.engine.submission import IN_FLIGHT_PER_THREAD, Submission, submit_units
 from romandask.engine.task import Batch, Task
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline

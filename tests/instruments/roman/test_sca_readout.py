@@ -9,9 +9,9 @@ import pytest
 from astropy.io import fits
 from conftest import MINI, command
 from PIL import Image
+from romandask.engine.task_queue import TaskQueue
 
 from romandask.engine.task import Task
-from romandask.engine.task_queue import TaskQueue
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.sca_readout import DAY, age, before
 from romandask.kernels.detectors.sca import MEMORY

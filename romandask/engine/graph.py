@@ -1,0 +1,177 @@
+"""The graph of a run: a dask collection with a layer for each stage, a task for each stale unit, and an edge for each
+unit that a unit is made from."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import dask.threaded
+from dask._task_spec import Task as DaskTask
+from dask._task_spec import TaskRef
+from dask.base import DaskMethodsMixin
+from dask.highlevelgraph import HighLevelGraph, MaterializedLayer
+
+from romandask.engine.staleness import Source
+from romandask.engine.task import Product, Task, UnitResult, make_unit
+from romandask.storage.checksums import remove_checksums
+from romandask.storage.store import Store
+
+RETRIES = 2
+"""Number of times that dask tries a failing unit again."""
+GROUP = 200
+"""Number of units whose end is awaited by one task, so that no task has thousands of dependencies."""
+Key = tuple[str, str]
+"""Key of a dask task: name of the layer, and name of the unit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageUnits:
+    """The units of one stage that a graph makes."""
+
+    product: Product
+    tasks: dict[str, Task]
+    """Tasks by name of the unit."""
+    sources: dict[str, tuple[Source, ...]]
+    """Units of the graph that each unit waits for, by name of the unit, in the order of `make_unit`."""
+    last: bool = False
+    """True if no stage reads this one: its units are made when workers have nothing else to do."""
+    finish: Callable[[Product, Store], None] | None = None
+    """Writes the files of the stage that belong to no unit, when all units are stored; must be picklable."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnitGraph(DaskMethodsMixin):
+    """The stale units of a survey as a lazy dask collection.
+
+    `compute()` makes and stores the units and returns a dict of `UnitResult` by "<stage>/<unit>". It runs on threads
+    unless another scheduler is chosen: a client of a cluster, or one of dask's own. A unit that fails raises its
+    exception, as any dask collection does; `romandask.run` sets failures aside and continues.
+    """
+
+    stages: Sequence[StageUnits]
+    """Stages in the order of the plan."""
+    store: Store
+    """Store that the units are written to and that they read their inputs from."""
+    futures: Mapping[Key, Any] | None = None
+    """Futures of the tasks of a persisted collection."""
+    token: str = field(default_factory=lambda: f"0{uuid.uuid4().hex[:7]}")
+    """Part of the keys of the tasks. It begins with a digit, so that dask leaves it out of the names of task groups."""
+
+    def __len__(self) -> int:
+        return sum(len(stage.tasks) for stage in self.stages)
+
+    def __repr__(self) -> str:
+        return f"UnitGraph({len(self)} units of {len(self.stages)} stages)"
+
+    def layer(self, stage: str) -> str:
+        """Return the name of the layer of a stage."""
+        return f"{stage}-{self.token}"
+
+    def key(self, source: Source) -> Key:
+        """Return the key of the task of a unit."""
+        return self.layer(source[0]), source[1]
+
+    def unit_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
+        """Yield the tasks of the units of a stage by key."""
+        product = TaskRef(("begin-" + self.layer(stage.product.stage), "product"))
+        for name, task in stage.tasks.items():
+            key = self.key((stage.product.stage, name))
+            inputs = [TaskRef(self.key(source)) for source in stage.sources[name]]
+            # a data producer is sent to a worker only when the worker has a free thread: see docs/developer/run.md
+            yield key, DaskTask(key, make_unit, product, task, self.store, *inputs, _data_producer=True)
+
+    def begin_task(self, stage: StageUnits) -> tuple[Key, DaskTask]:
+        """Return the task that prepares the arrays of a stage and returns its product, which its units need."""
+        key = ("begin-" + self.layer(stage.product.stage), "product")
+        return key, DaskTask(key, begin_stage, stage.product, self.store)
+
+    def end_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
+        """Yield the tasks that write the files of a stage after its last unit; the last one is the end of the stage."""
+        name = stage.product.stage
+        waiting = [self.key((name, unit)) for unit in stage.tasks]
+        level = 0
+        while len(waiting) > GROUP:
+            groups = [waiting[first : first + GROUP] for first in range(0, len(waiting), GROUP)]
+            waiting = [("wait-" + self.layer(name), f"{level}-{number}") for number in range(len(groups))]
+            for key, group in zip(waiting, groups, strict=True):
+                yield key, DaskTask(key, _all_made, *map(TaskRef, group))
+            level += 1
+        key, begun = ("end-" + self.layer(name), "files"), self.begin_task(stage)[0]
+        yield key, DaskTask(key, _finish, stage.finish, TaskRef(begun), self.store, *map(TaskRef, waiting))
+
+    def __dask_graph__(self) -> HighLevelGraph | Mapping[Key, Any]:
+        return self.high_level_graph() if self.futures is None else self.futures
+
+    def high_level_graph(self) -> HighLevelGraph:
+        """Return the graph with a layer for each stage."""
+        layers: dict[str, MaterializedLayer] = {}
+        dependencies: dict[str, set[str]] = {}
+        for stage in self.stages:
+            name = self.layer(stage.product.stage)
+            tasks = dict([self.begin_task(stage), *self.unit_tasks(stage)])
+            if stage.finish is not None:
+                tasks |= dict(self.end_tasks(stage))
+            layers[name] = MaterializedLayer(tasks, annotations={"retries": RETRIES, "priority": -int(stage.last)})
+            read = {source[0] for sources in stage.sources.values() for source in sources}
+            dependencies[name] = {self.layer(other) for other in read} - {name}
+        return HighLevelGraph(layers, dependencies)
+
+    def __dask_keys__(self) -> list[Key]:
+        units = [self.key((stage.product.stage, name)) for stage in self.stages for name in stage.tasks]
+        ends = [
+            ("end-" + self.layer(stage.product.stage), "files") for stage in self.stages if stage.finish is not None
+        ]
+        return [*units, *ends]
+
+    def __dask_layers__(self) -> tuple[str, ...]:
+        return tuple(self.layer(stage.product.stage) for stage in self.stages)
+
+    def __dask_tokenize__(self) -> str:
+        return self.token
+
+    __dask_scheduler__ = staticmethod(dask.threaded.get)
+    __dask_optimize__ = None
+
+    def __dask_postcompute__(self) -> tuple[Callable[..., dict[str, UnitResult]], tuple[Any, ...]]:
+        names = [f"{stage.product.stage}/{name}" for stage in self.stages for name in stage.tasks]
+        return _by_name, (names,)
+
+    def __dask_postpersist__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return partial(_persisted, self), ()
+
+
+_BEGIN = threading.Lock()
+
+
+def begin_stage(product: Product, store: Store) -> Product:
+    """Create the arrays of a product in a store and return the product.
+
+    It may be called again while units are written, when the worker that had the result is lost: what exists and is
+    right is not written again.
+    """
+    with _BEGIN:
+        remove_checksums(store, product.stage)
+        product.prepare(store)
+    return product
+
+
+def _all_made(*units: Any) -> int:
+    return len(units)
+
+
+def _finish(finish: Callable[[Product, Store], None], product: Product, store: Store, *made: Any) -> str:
+    finish(product, store)
+    return product.stage
+
+
+def _persisted(graph: UnitGraph, futures: Mapping[Key, Any], rename: Any = None) -> UnitGraph:
+    return replace(graph, futures=futures)
+
+
+def _by_name(results: Sequence[Any], names: Sequence[str]) -> dict[str, UnitResult]:
+    return dict(zip(names, results, strict=False))

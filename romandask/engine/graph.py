@@ -62,6 +62,12 @@ class UnitGraph(DaskMethodsMixin):
     token: str = field(default_factory=lambda: f"0{uuid.uuid4().hex[:7]}")
     """Part of the keys of the tasks. It begins with a digit, so that dask leaves it out of the names of task groups."""
 
+    @classmethod
+    def of(cls, product: Product, store: Store) -> UnitGraph:
+        """Return the graph of all units of one product that have no record; their inputs must be stored."""
+        tasks = {name: Task(index, {"stage": product.stage}) for index, name in enumerate(product.names)}
+        return cls([StageUnits(product=product, tasks=tasks, sources=dict.fromkeys(tasks, ()))], store)
+
     def __len__(self) -> int:
         return sum(len(stage.tasks) for stage in self.stages)
 

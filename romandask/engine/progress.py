@@ -17,6 +17,8 @@ LINE_INTERVAL = 5.0
 """Minimum time between two plain lines of a stage, s."""
 TOTAL = "all stages"
 """Name of the progress of the whole run."""
+SHOWN_STAGES = 4
+"""Largest number of active stages in a plain line."""
 MAX_SILENCE = 8.0
 """Time without output after which the current activity is printed again, s."""
 
@@ -237,7 +239,10 @@ class _Lines:
 
     def text(self) -> str:
         """Return one line with the progress of the run and of each active stage."""
-        stages = ", ".join(f"{name} {pace.done}/{pace.units}" for name, pace in self._active.copy().items())
+        active = [f"{name} {pace.done}/{pace.units}" for name, pace in self._active.copy().items()]
+        if len(active) > SHOWN_STAGES:
+            active[SHOWN_STAGES - 1 :] = [f"{len(active) - SHOWN_STAGES + 1} more"]
+        stages = ", ".join(active)
         total = self._total.text(TOTAL, time.monotonic()) if self._total.units else ""
         return ": ".join(filter(None, (total, stages)))
 

@@ -17,8 +17,8 @@ import cdshealpix.nested as healpix
 import numpy as np
 import pandas as pd
 
-from romandask.engine.clients import runner
-from romandask.engine.task import Batch, Task
+from romandask.engine.clients import Ended, runner
+from romandask.engine.graph import UnitGraph
 from romandask.kernels.measurement.groups import forest, label, links
 from romandask.model.seeds import rng
 from romandask.model.settings import MatchSettings
@@ -121,10 +121,10 @@ def whole_survey() -> None:
 
         def run(product: TableProduct) -> tuple[float, int, int]:
             start, rows, peak = time.perf_counter(), 0, 0
-            tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-            for outcome in execution.run(Batch(product, tasks, store)):
-                assert outcome.record is not None, outcome.failure
-                rows, peak = rows + outcome.record.rows, max(peak, outcome.record.peak_bytes)
+            for ended in execution.run(UnitGraph.of(product, store)):
+                assert isinstance(ended, Ended)
+                assert ended.result is not None, ended.failure
+                rows, peak = rows + ended.result.rows, max(peak, ended.result.peak_bytes)
             return time.perf_counter() - start, rows, peak
 
         for name, table in tables.items():

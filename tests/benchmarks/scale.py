@@ -10,7 +10,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Generator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,9 +20,10 @@ from rich.console import Console
 
 from romandask import run as running
 from romandask.engine import run_stages
-from romandask.engine.clients import Runner, runner
+from romandask.engine.clients import Ended, Runner, runner
+from romandask.engine.graph import StageUnits, UnitGraph
+from romandask.engine.lost_units import Lost
 from romandask.engine.progress import Reporter
-from romandask.engine.task import Batch, Outcome
 from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
@@ -42,8 +43,10 @@ class Nothing:
     product: ImageProduct | TableProduct
     stage: str
     names: tuple[str, ...]
-    seconds_per_unit: float
     bytes_per_unit: int
+
+    def prepare(self, store: Store) -> None:
+        pass
 
     def write(self, index: int, store: Store) -> Made:
         return Made(self.names[index], 0, 0)
@@ -60,16 +63,15 @@ class Idle:
     def recording(self, path: AnyPath) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def run(self, *begin: Batch, more: Callable[[], Iterable[Batch]]) -> Generator[Outcome, None, None]:
-        yield from self._runner.run(*map(self._emptied, begin), more=lambda: map(self._emptied, more()))
+    def run(self, graph: UnitGraph) -> Generator[Ended | Lost, None, None]:
+        yield from self._runner.run(replace(graph, stages=[self._emptied(stage) for stage in graph.stages]))
 
-    def _emptied(self, batch: Batch) -> Batch:
-        product = batch.product
+    def _emptied(self, stage: StageUnits) -> StageUnits:
+        product = stage.product
         self.largest = max(self.largest, len(cloudpickle.dumps(product)))
         if product.stage.startswith("pointings/"):
-            return batch
-        nothing = Nothing(product, product.stage, product.names, product.seconds_per_unit, product.bytes_per_unit)
-        return replace(batch, product=nothing)
+            return stage
+        return replace(stage, product=Nothing(product, product.stage, product.names, product.bytes_per_unit))
 
 
 def main(overrides: list[str]) -> None:

@@ -2,8 +2,9 @@
 
 import gc
 import os
+import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import dask
@@ -13,12 +14,11 @@ import psutil
 import pyarrow as pa
 import pytest
 from distributed import Client, LocalCluster
-from romandask.engine.submission import ATTEMPTS
-from romandask.engine.task_queue import TaskQueue
 
 from romandask.engine import clients
-from romandask.engine.clients import runner
-from romandask.engine.task import Batch, Task
+from romandask.engine.clients import Ended, runner
+from romandask.engine.graph import RETRIES, UnitGraph
+from romandask.engine.lost_units import Lost
 from romandask.model.errors import UserError
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
@@ -41,26 +41,34 @@ class FailingMaker:
         return pd.DataFrame({"number": np.array([index], np.int64)})
 
 
+def graph_of(product: TableProduct, store: Store, sources: dict[int, tuple[int, ...]] | None = None) -> UnitGraph:
+    """Return the graph of all units of a product, some of which wait for others."""
+    (stage,) = UnitGraph.of(product, store).stages
+    waits = {
+        name: tuple((product.stage, product.names[k]) for k in (sources or {}).get(index, ()))
+        for index, name in enumerate(product.names)
+    }
+    return UnitGraph([replace(stage, sources=waits)], store)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_units_that_depend_on_a_failed_unit_are_skipped_and_all_others_are_made(tmp_path, workers):
     maker = FailingMaker(tmp_path, (1,))
     units = tuple(Unit(f"u{k}", k) for k in range(6))
     product = TableProduct(stage="table/x", units=units, make=maker, schema=pa.schema([("number", pa.int64())]))
-    # unit 1 fails; 2 and 4 need it and 3 needs 2; 5 needs only 0
-    prerequisites = {2: (1,), 3: (2,), 4: (1, 0), 5: (0,)}
-    tasks = [Task(k, "inputs", 1.0, "", prerequisites.get(k, ())) for k in range(6)]
     store = Store(tmp_path / "store")
+    # unit 1 fails; 2 and 4 need it and 3 needs 2; 5 needs only 0
+    graph = graph_of(product, store, {2: (1,), 3: (2,), 4: (1, 0), 5: (0,)})
     with runner(workers, 1.5) as execution:
-        outcomes = {outcome.index: outcome for outcome in execution.run(Batch(product, tasks, store))}
-    assert sorted(outcomes) == [0, 1, 2, 3, 4, 5]
-    assert {k for k, outcome in outcomes.items() if outcome.record is None} == {1, 2, 3, 4}
-    assert "ArithmeticError: unit 1 cannot be made" in outcomes[1].failure
+        ends = {int(ended.source[1][1:]): ended for ended in execution.run(graph)}
+    assert sorted(ends) == [0, 1, 2, 3, 4, 5]
+    assert {k for k, ended in ends.items() if ended.result is None} == {1, 2, 3, 4}
+    assert "ArithmeticError: unit 1 cannot be made" in ends[1].failure
     for k in (2, 3, 4):
         assert not (tmp_path / f"{k}.tried").exists(), "a skipped unit is not tried"
-        assert "u1" in outcomes[k].failure or "u2" in outcomes[k].failure
     attempts = len((tmp_path / "1.tried").read_text())
-    assert attempts == (ATTEMPTS if workers else 1)
+    assert attempts == (1 + RETRIES if workers else 1)
     for k in (0, 5):
         assert product.stored(store).load(k)["number"].tolist() == [k]
 
@@ -69,53 +77,49 @@ def test_units_that_depend_on_a_failed_unit_are_skipped_and_all_others_are_made(
 class SlowMaker:
     """Makes one row per unit with the process id, slowly."""
 
+    seconds: float = 0.4
+
     def __call__(self, index: int) -> pd.DataFrame:
-        time.sleep(0.4)
+        time.sleep(self.seconds)
         return pd.DataFrame({"process": np.array([os.getpid()], np.int64)})
 
 
+PROCESS = pa.schema([("process", pa.int64())])
+
+
 @pytest.mark.slow
-def test_the_last_of_a_few_long_units_goes_to_a_free_worker(tmp_path):
-    """Of three units on two workers, the third goes to the worker that is free first, whatever dask has timed."""
+def test_a_unit_goes_to_a_worker_with_a_free_thread(tmp_path):
+    """Of three units on two workers, the third goes to the worker that is free first; none waits behind another."""
     units = tuple(Unit(f"u{k}", k) for k in range(3))
-    product = TableProduct(
-        stage="table/x",
-        units=units,
-        make=SlowMaker(),
-        schema=pa.schema([("process", pa.int64())]),
-        seconds_per_unit=60.0,
-    )
+    product = TableProduct(stage="table/x", units=units, make=SlowMaker(), schema=PROCESS)
     store = Store(tmp_path / "store")
     with runner(2, 1.5) as execution:
-        tasks = [Task(k, "inputs", 1.0, f"key {k % 2}") for k in range(3)]
-        outcomes = list(execution.run(Batch(product, tasks, store)))
-    assert all(outcome.record for outcome in outcomes)
+        assert all(ended.result for ended in execution.run(UnitGraph.of(product, store)))
     processes = [product.stored(store).load(k)["process"].iloc[0] for k in range(3)]
     assert len(set(processes)) == 2
 
 
-def test_a_free_worker_continues_with_its_affinity_key():
-    tasks = [Task(k, "inputs", 1.0, affinity) for k, affinity in enumerate(["a", "a", "b", "b", "c"])]
-    waiting = TaskQueue(tasks)
-    assert waiting.next(None, ()).index == 0
-    # a second worker starts with a key that no other worker has, and continues with it
-    assert waiting.next(None, {"a"}).index == 2
-    assert waiting.next("b", {"a"}).index == 3
-    assert waiting.next("b", {"a"}).index == 4
-    # without other tasks left, it takes one of a busy key
-    assert waiting.next("c", {"a"}).index == 1
-    assert not waiting
+@dataclass(frozen=True)
+class DyingMaker:
+    """Ends its worker by a signal at the first attempt."""
+
+    path: Path
+
+    def __call__(self, index: int) -> pd.DataFrame:
+        if not self.path.exists():
+            self.path.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return pd.DataFrame({"process": np.array([os.getpid()], np.int64)})
 
 
-def test_the_most_expensive_task_is_first_and_prerequisites_are_before_their_dependents():
-    tasks = [
-        Task(0, "", 1.0, "x"),
-        Task(1, "", 5.0, "y"),
-        Task(2, "", 3.0, "x", prerequisites=(0,)),
-        Task(3, "", 2.0, "z"),
-    ]
-    waiting = TaskQueue(tasks)
-    assert [waiting.next().index for _ in tasks] == [1, 0, 2, 3]
+@pytest.mark.slow
+def test_a_unit_that_is_lost_with_its_worker_is_made_again_and_reported(tmp_path):
+    product = TableProduct(stage="table/x", units=(Unit("u0", 0),), make=DyingMaker(tmp_path / "died"), schema=PROCESS)
+    with runner(1, 1.5) as execution:
+        ends = list(execution.run(UnitGraph.of(product, Store(tmp_path / "store"))))
+    losses = [end for end in ends if isinstance(end, Lost)]
+    assert losses == [Lost(("table/x", "u0"), "signal SIGKILL")]
+    assert [end.result.made for end in ends if isinstance(end, Ended)] == [True]
 
 
 def test_workers_that_die_during_their_start_are_started_again(monkeypatch):
@@ -147,13 +151,12 @@ def test_lost_local_workers_are_started_again(tmp_path):
     product = TableProduct(
         stage="table/x", units=units, make=FailingMaker(tmp_path, ()), schema=pa.schema([("number", pa.int64())])
     )
-    tasks = [Task(k, "inputs", 1.0) for k in range(3)]
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}), runner(1, 1.5) as execution:
         execution._client.retire_workers(close_workers=True)
         assert not execution._client.scheduler_info()["workers"]
-        outcomes = list(execution.run(Batch(product, tasks, Store(tmp_path / "store"))))
-    assert all(outcome.record is not None for outcome in outcomes)
-    assert len(outcomes) == 3
+        ends = list(execution.run(UnitGraph.of(product, Store(tmp_path / "store"))))
+    assert all(ended.result is not None for ended in ends)
+    assert len(ends) == 3
 
 
 def test_a_local_cluster_listens_only_on_the_loopback_interface():

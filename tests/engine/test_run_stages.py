@@ -4,7 +4,6 @@ import io
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -12,14 +11,12 @@ import pyarrow as pa
 import pytest
 from conftest import MINI
 from rich.console import Console
-from romandask.engine.submission import IN_FLIGHT_PER_THREAD, Submission, submit_units
 
 from romandask import run as running
 from romandask.engine.clients import InProcess, runner
 from romandask.engine.event_log import Log, events
 from romandask.engine.progress import Reporter
 from romandask.engine.run_stages import Run, RunnableStage, run_stages
-from romandask.engine.task import Batch, Task
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct
@@ -92,9 +89,9 @@ def test_independent_stages_run_at_the_same_time(tmp_path):
         logged, summary = logged_events(stages, tmp_path, execution)
     assert summary.made == {"coadds/x": 1, "detections/x": 2, "truth_index/x": 3}
     assert not summary.failed
-    assert logged[:2] == [("stage", "coadds/x", None), ("stage", "truth_index/x", None)]
+    assert [stage for event, stage, _ in logged if event == "stage"] == ["coadds/x", "detections/x", "truth_index/x"]
     position = {event: k for k, event in enumerate(logged)}
-    assert position["stage", "detections/x", None] > position["unit", "coadds/x", "u0"], "a reader starts later"
+    assert position["unit", "detections/x", "u0"] > position["unit", "coadds/x", "u0"], "a reader is made later"
 
 
 def test_in_one_process_stages_run_in_order(tmp_path):
@@ -146,72 +143,81 @@ def test_stages_that_wait_for_one_another_raise_an_error(tmp_path):
         logged_events(stages, tmp_path)
 
 
-class FakeFuture(SimpleNamespace):
-    """Future of a task that has finished."""
+@dataclass(frozen=True)
+class NamingMaker:
+    """Makes one row per unit, and appends the name of the stage and the unit to a file."""
 
-    __hash__ = object.__hash__
+    path: Path
+    stage: str
+    value: int = 0
 
-
-class FakeClient:
-    """Client that records the submitted tasks and runs none."""
-
-    def __init__(self):
-        self.sent = []
-        """(stage kind, preferred worker, future) of each task."""
-
-    def submit(self, _function, *arguments, key, workers=(None,), **_):
-        future = FakeFuture(status="finished", result=lambda: None, release=lambda: None, key=key)
-        future.add_done_callback = lambda call: None
-        if len(arguments) > 1:
-            self.sent.append((key.split("-")[0], workers[0], future))
-        return future
+    def __call__(self, index: int) -> pd.DataFrame:
+        with self.path.open("a") as file:
+            file.write(f"{self.stage}/u{index} ")
+        return pd.DataFrame({"number": np.array([index + self.value], np.int64)})
 
 
-def test_units_of_a_later_stage_are_submitted_after_those_of_an_earlier_one(tmp_path):
-    client, threads = FakeClient(), {"one": 1, "two": 1}
+def chain(folder, value=0, settings=0):
+    """Return three stages: two coadds of one exposure each, and a detection of both coadds."""
+    path = folder / "made"
 
-    def submission(name, units, seconds, rank):
-        product = TableProduct(
-            stage=name,
-            units=tuple(Unit(f"u{k}", k) for k in range(units)),
-            make=WaitingMaker(),
-            schema=SCHEMA,
-            seconds_per_unit=seconds,
-        )
-        tasks = [Task(k, "inputs", 1.0) for k in range(units)]
-        return Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
+    def stage(name, inputs_of, units, value=0, settings=0):
+        made = tuple(Unit(f"u{k}", settings, inputs_of(k)) for k in range(units))
+        maker = NamingMaker(path, name, value)
+        product = TableProduct(stage=name, units=made, make=maker, schema=SCHEMA)
+        reads = frozenset(source for unit in made for source, _ in unit.inputs)
+        return RunnableStage(name=name, product=lambda: product, reads=reads)
 
-    submissions = [submission("coadds/x", 3, 60.0, 0), submission("truth_index/x", 100, 1.0, 1)]
-    submit_units(submissions, threads)
-    assert [sent[:2] for sent in client.sent] == [("coadds", "one"), ("coadds", "two")], "one long unit per thread"
-    assert submissions[0].settle(client.sent[0][2])[0].index == 0
-    submit_units(submissions, threads)
-    assert client.sent[2][:2] == ("coadds", "one"), "the free worker"
-    assert [name for name, *_ in client.sent[3:]] == ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 2)
-
-
-def test_units_that_wait_for_prerequisites_leave_free_workers_to_a_later_stage(tmp_path):
-    """Each of twenty exposures of one detector needs the one before it: the other worker makes the truth index."""
-    client, threads = FakeClient(), {"one": 1, "two": 1}
-    first, second = (
-        TableProduct(
-            stage=name,
-            units=tuple(Unit(f"u{k}", k) for k in range(20)),
-            make=WaitingMaker(),
-            schema=SCHEMA,
-            seconds_per_unit=seconds,
-        )
-        for name, seconds in (("exposures/x", 60.0), ("truth_index/x", 1.0))
-    )
-    chain = [Task(k, "inputs", 20.0 - k, "", (k - 1,) if k else ()) for k in range(20)]
-    independent = [Task(k, "inputs", 1.0) for k in range(20)]
-    submissions = [
-        Submission(client, Batch(product, tasks, Store(tmp_path), rank), lambda future: None)
-        for rank, (product, tasks) in enumerate([(first, chain), (second, independent)])
+    return [
+        stage("exposures/x", lambda k: (), 2, value, settings),
+        stage("coadds/x", lambda k: (("exposures/x", f"u{k}"),), 2),
+        stage("detections/x", lambda k: (("coadds/x", "u0"), ("coadds/x", "u1")), 1),
     ]
-    submit_units(submissions, threads)
-    sent = [name for name, *_ in client.sent]
-    assert sent == ["exposures"] * (1 + IN_FLIGHT_PER_THREAD * 2) + ["truth_index"] * (IN_FLIGHT_PER_THREAD * 2 - 1)
+
+
+def made_in(folder):
+    path = folder / "made"
+    names = path.read_text().split() if path.exists() else []
+    path.unlink(missing_ok=True)
+    return names
+
+
+def test_units_whose_inputs_are_made_again_without_a_change_are_kept(tmp_path):
+    """Only the setting of the exposures changes, and then their content."""
+    _, summary = logged_events(chain(tmp_path), tmp_path)
+    assert summary.made == {"exposures/x": 2, "coadds/x": 2, "detections/x": 1}
+    assert len(made_in(tmp_path)) == 5
+    _, summary = logged_events(chain(tmp_path, settings=1), tmp_path)
+    assert made_in(tmp_path) == ["exposures/x/u0", "exposures/x/u1"]
+    assert summary.made == {"exposures/x": 2, "coadds/x": 0, "detections/x": 0}
+    assert summary.kept == {"exposures/x": 0, "coadds/x": 2, "detections/x": 1}
+    _, summary = logged_events(chain(tmp_path, settings=1, value=5), tmp_path)
+    assert not made_in(tmp_path), "the code of a maker is not part of the input hash, its settings are"
+    logged, summary = logged_events(chain(tmp_path, settings=2, value=5), tmp_path)
+    assert summary.made == {"exposures/x": 2, "coadds/x": 2, "detections/x": 0}, "the rows of coadds are as before"
+    assert [event for event in logged if event[0] == "unit"][-1][1] == "coadds/x"
+
+
+def test_a_unit_is_made_without_an_optional_input_that_failed(tmp_path):
+    """Zero points use the detections that are there; a unit that needs a failed one is skipped."""
+    zero = TableProduct(
+        stage="zero_points/x",
+        units=(Unit("all", 0, optional=(("detections/x", "u0"), ("detections/x", "u1"))),),
+        make=WaitingMaker(),
+        schema=SCHEMA,
+    )
+    stages = [
+        stage_of("detections/x", 2, WaitingMaker(failing=(1,))),
+        RunnableStage(name="zero_points/x", product=lambda: zero, reads=frozenset({"detections/x"})),
+        stage_of("objects/x", 1, WaitingMaker(), (("zero_points/x", "all"), ("detections/x", "u0"))),
+        stage_of("matches/x", 1, WaitingMaker(), (("zero_points/x", "all"), ("detections/x", "u1"))),
+    ]
+    _, summary = logged_events(stages, tmp_path)
+    assert summary.made == {"detections/x": 1, "zero_points/x": 1, "objects/x": 1, "matches/x": 0}
+    assert summary.failed == ["detections/x/u1", "matches/x/u0 (an input is missing)"]
+    _, again = logged_events(stages, tmp_path)
+    assert not any(again.made.values())
+    assert again.failed == ["detections/x/u1 (skipped, it failed before)", "matches/x/u0 (an input is missing)"]
 
 
 @pytest.mark.slow

@@ -9,9 +9,7 @@ import pytest
 from astropy.io import fits
 from conftest import MINI, command
 from PIL import Image
-from romandask.engine.task_queue import TaskQueue
 
-from romandask.engine.task import Task
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.sca_readout import DAY, age, before
 from romandask.kernels.detectors.sca import MEMORY
@@ -88,26 +86,6 @@ def test_traps_hold_interpolated_charge_of_bright_pixels_only():
     assert current[1, 0] == pytest.approx(5 / 100 + 5 / 400)
     assert current[96, 196] == pytest.approx(at[2, 0] / 200, rel=1e-5)
     assert afterglow([]) is None
-
-
-def test_tasks_run_after_their_prerequisites():
-    tasks = [
-        Task(0, "", 1.0, "b"),
-        Task(1, "", 9.0, "a", (3,)),
-        Task(2, "", 5.0, "a", (1,)),
-        Task(3, "", 1.0, "c", (0,)),
-    ]
-    queue = TaskQueue(tasks)
-    order = []
-    while queue:
-        order.append(queue.next().index)
-    assert order == [0, 3, 1, 2]
-    queue = TaskQueue(tasks)
-    queue.next()
-    assert [task.index for task in queue.give_up(0)] == [3, 1, 2]
-    assert not queue
-    queue.again(tasks[0])
-    assert queue.next() == tasks[0]
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from romandask.engine.clients import InProcess
-from romandask.engine.task import Batch, Task
+from romandask.engine.graph import UnitGraph
 from romandask.kernels.measurement.counts import counts_limit
 from romandask.model.settings import MatchSettings
 from romandask.model.sky import Region
@@ -121,9 +120,7 @@ def made(sky, settings: MatchSettings, folder):
     store, tables = Store(folder), {}
 
     def stored(product: TableProduct) -> TableProduct:
-        tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-        for outcome in InProcess().run(Batch(product, tasks, store)):
-            assert outcome.record, outcome.failure
+        UnitGraph.of(product, store).compute(scheduler="sync")
         return product.stored(store)
 
     for name, tables_of, bands, band in (("roman", roman, ROMAN, "H158"), ("rubin", rubin, RUBIN, "i")):

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from romandask.engine.clients import InProcess
-from romandask.engine.task import Batch, Task
+from romandask.engine.graph import UnitGraph
 from romandask.kernels.measurement.groups import forest, label, links
 from romandask.model.errors import UserError
 from romandask.model.settings import MatchSettings
@@ -98,8 +97,7 @@ def stored_matches(products, settings: MatchSettings, folder, prefix: str = "mat
     store = Store(folder)
     made = matches(products, codes_of(products), settings, REGION, store, prefix, shift)
     for product in (made.local, made.crossing, made.merged, made.groups):
-        tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-        assert all(outcome.record for outcome in InProcess().run(Batch(product, tasks, store)))
+        UnitGraph.of(product, store).compute(scheduler="sync")
     return made
 
 

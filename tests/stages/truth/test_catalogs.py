@@ -18,8 +18,8 @@ from hats.loaders import read_hats
 from rich.console import Console
 
 from romandask.engine.clients import InProcess
+from romandask.engine.graph import UnitGraph
 from romandask.engine.progress import Reporter
-from romandask.engine.task import Batch, Task
 from romandask.export.truth import export_truth
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError
@@ -51,9 +51,7 @@ def sample(shared, **settings):
 
 def stored(product, store):
     """Return the product after all its units and HATS files have been stored."""
-    tasks = [Task(index, "", 1.0) for index in range(len(product.units))]
-    outcomes = list(InProcess().run(Batch(product, tasks, store)))
-    assert all(outcome.record for outcome in outcomes), [outcome.failure for outcome in outcomes]
+    UnitGraph.of(product, store).compute(scheduler="sync")
     if product.pixels is not None:
         write_catalog_files(product, store)
     return product.stored(store)

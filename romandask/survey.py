@@ -393,22 +393,10 @@ class Survey:
         return _select(self.instruments, survey)
 
     def graph(self, stages: Sequence[str] = (), region: Region | None = None) -> UnitGraph:
-        """Return the stale units as a lazy dask collection: a task for each unit, a layer for each stage.
-
-        `graph().compute()` makes and stores them on threads; inside a `distributed.Client`, on its cluster. The
-        command `romandask run` computes the same graph, with progress, log and failures set aside.
-
-        Parameters
-        ----------
-        stages : sequence of str
-            Names (`coadds/roman`) or kinds (`coadds`) of products; by default all.
-        region : Region, optional
-            Make only the units of tiles, exposures and partitions that touch this area, and what they are made from.
-        """
+        """Return the stale units as a lazy dask collection (see `romandask.survey_graph.unit_graph`)."""
         return unit_graph(self, stages, region)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # what has been built is built again where it is needed
         return Survey, (self.pipeline, self.store)
 
     def __repr__(self) -> str:

@@ -111,7 +111,11 @@ def ignore_stale_unit_lists(survey: StoredSurvey, products: list[StageProduct]) 
 
 
 def unit_graph(survey: StoredSurvey, stages: Sequence[str] = (), region: Region | None = None) -> UnitGraph:
-    """Return the stale units of a survey as a lazy dask collection. Nothing is made or changed.
+    """Return the stale units of a survey as a lazy dask collection: a layer for each stage, a task for each unit.
+
+    Nothing is made or changed before it is computed. `unit_graph(...).compute()` makes and stores the units on threads;
+    inside a `distributed.Client`, on its cluster. The command `romandask run` computes the same graph, with progress,
+    a log, and failures set aside.
 
     Parameters
     ----------
@@ -176,7 +180,7 @@ def _touching(survey: StoredSurvey, product: Product, region: Region) -> Collect
     instrument = product.stage.split("/")[-1]
     if isinstance(product, ImageProduct) and product.axes[0] == "tile":
         tiles = [tile.name for tile in survey.pipeline.coadds.grid().covering(region)]
-        return {name for name in product.names if name.startswith(tuple(f"{tile}" for tile in tiles))}
+        return {name for name in product.names if name.startswith(tuple(tiles))}
     if instrument in survey.instruments:
         exposures = survey.output(f"exposures/{instrument}")
         if isinstance(exposures, Exposures) and product.names == exposures.names:

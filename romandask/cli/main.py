@@ -151,6 +151,8 @@ def run(
         reporter.say(f"nothing to do: all {kept} units of {store} are done")
     else:
         reporter.say(f"made {made} units, kept {kept}, in {time.monotonic() - start_time:.0f} s")
+    for reason, units in summary.lost.most_common():
+        reporter.say(f"{units} units were lost with their worker and made again: {reason}")
     for text, units in summary.warnings.most_common():
         reporter.say(f"warning of {units} units: {text}")
     for name in summary.failed:

@@ -22,10 +22,10 @@ from typing import Any, Protocol
 
 import dask
 import yaml
-from distributed import Client, KilledWorker, LocalCluster, performance_report
+from distributed import Client, KilledWorker, LocalCluster, Nanny, performance_report
 
 from romandask.engine.graph import Key, StageUnits, UnitGraph, begin_stage
-from romandask.engine.lost_units import Lost, ReportingNanny, watched_workers
+from romandask.engine.lost_units import EXIT_TOPIC, Lost, watched_workers
 from romandask.engine.staleness import Source
 from romandask.engine.task import UnitResult, make_unit
 from romandask.model.errors import UserError
@@ -289,6 +289,15 @@ def on_client(client: Client, memory_limit: float, cluster_name: str = "the clus
     return OnCluster(
         client, f"cluster at {client.scheduler_info(n_workers=0)['address']}, dashboard {client.dashboard_link}"
     )
+
+
+class ReportingNanny(Nanny):
+    """Nanny that logs an event with the exit code when its worker process ends."""
+
+    def _on_worker_exit_sync(self, exitcode: int) -> None:
+        if self.worker_address is not None:
+            self.log_event(EXIT_TOPIC, {"worker": self.worker_address, "exitcode": exitcode})
+        super()._on_worker_exit_sync(exitcode)
 
 
 def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:

@@ -10,15 +10,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client, Nanny
-
 from romandask.engine.graph import Key
 from romandask.engine.staleness import Source
 
 REASON_DELAY = 3.0
 """Time within which the reason why a worker ended becomes known after its end, s."""
 EXIT_TOPIC = "romandask-worker-exit"
-"""Topic of the events that `ReportingNanny` logs."""
+"""Topic of the events with the exit codes of worker processes."""
 CONNECTION = "connection lost"
 """Reason of a lost worker of which no more is known."""
 
@@ -31,15 +29,6 @@ class Lost:
     """Stage and name of the unit."""
     reason: str
     """Why the worker ended: memory, a signal, or a lost connection."""
-
-
-class ReportingNanny(Nanny):
-    """Nanny that logs an event with the exit code when its worker process ends."""
-
-    def _on_worker_exit_sync(self, exitcode: int) -> None:
-        if self.worker_address is not None:
-            self.log_event(EXIT_TOPIC, {"worker": self.worker_address, "exitcode": exitcode})
-        super()._on_worker_exit_sync(exitcode)
 
 
 class Losses:
@@ -102,7 +91,7 @@ class Losses:
 
 
 @contextmanager
-def watched_workers(client: Client, sources: Mapping[Key, Source]) -> Iterator[Losses]:
+def watched_workers(client: Any, sources: Mapping[Key, Source]) -> Iterator[Losses]:
     """Return a context manager with the losses of a cluster while it makes some units.
 
     Parameters

@@ -80,7 +80,7 @@ def wall_time(graph: UnitGraph, workers: int) -> float:
     """Return the time of a graph on some workers, which are threads of this process, s."""
     with (
         LocalCluster(
-            workers, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0
+            n_workers=workers, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0
         ) as cluster,
         Client(cluster) as client,
     ):

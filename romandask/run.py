@@ -12,10 +12,11 @@ from typing import Any
 
 from rich.console import Console
 
-from romandask.engine.clients import Client, Runner, on_client
+from romandask.engine.clients import Client, on_client
 from romandask.engine.event_log import Log, newest_event
 from romandask.engine.progress import Reporter
 from romandask.engine.run_stages import Run, Summary, run_stages
+from romandask.engine.runners import Runner
 from romandask.engine.staleness import StoredOutputs, failed, find_stale
 from romandask.engine.verify import Verified, forget, verify
 from romandask.model.errors import UserError

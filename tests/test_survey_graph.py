@@ -9,8 +9,8 @@ from output_hashes import output_hashes
 from rich.console import Console
 
 from romandask import run as running
-from romandask.engine.clients import InProcess
 from romandask.engine.progress import Reporter
+from romandask.engine.runners import InProcess
 from romandask.engine.verify import verify
 from romandask.model.errors import UserError
 from romandask.model.sky import Region

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -15,6 +15,7 @@ from dask._task_spec import Task as DaskTask
 from dask._task_spec import TaskRef
 from dask.base import DaskMethodsMixin
 from dask.highlevelgraph import HighLevelGraph, MaterializedLayer
+from dask.order import order
 
 from romandask.engine.staleness import Source
 from romandask.engine.task import Product, Task, UnitResult, make_unit
@@ -113,19 +114,72 @@ class UnitGraph(DaskMethodsMixin):
     def __dask_graph__(self) -> HighLevelGraph | Mapping[Key, Any]:
         return self.high_level_graph() if self.futures is None else self.futures
 
-    def high_level_graph(self) -> HighLevelGraph:
-        """Return the graph with a layer for each stage."""
+    def high_level_graph(self, begun: Set[str] = frozenset()) -> HighLevelGraph:
+        """Return the graph with a layer for each stage.
+
+        Parameters
+        ----------
+        begun : set of str
+            Stages whose first task (`begin_task`) was submitted before.
+        """
         layers: dict[str, MaterializedLayer] = {}
         dependencies: dict[str, set[str]] = {}
         for stage in self.stages:
             name = self.layer(stage.product.stage)
-            tasks = dict([self.begin_task(stage), *self.unit_tasks(stage)])
+            tasks = dict(self.unit_tasks(stage))
+            if stage.product.stage not in begun:
+                tasks |= dict([self.begin_task(stage)])
             if stage.finish is not None:
                 tasks |= dict(self.end_tasks(stage))
             layers[name] = MaterializedLayer(tasks, annotations={"retries": RETRIES, "priority": -int(stage.last)})
             read = {source[0] for sources in stage.sources.values() for source in sources}
             dependencies[name] = {self.layer(other) for other in read} - {name}
-        return HighLevelGraph(layers, dependencies)
+        present = set(layers)
+        return HighLevelGraph(layers, {name: needed & present for name, needed in dependencies.items()})
+
+    def pieces(self, size: int) -> list[set[Source]]:
+        """Return the units in pieces of a size, so that no unit is in an earlier piece than one that it waits for.
+
+        Units follow the order in which dask would run them, from one place on the sky to the next; units of stages that
+        no other stage reads come last.
+
+        Parameters
+        ----------
+        size : int
+            Largest number of units of a piece.
+        """
+        units = [(stage.product.stage, name) for stage in self.stages for name in stage.tasks]
+        if len(units) <= size:
+            return [set(units)]
+        last = {stage.product.stage for stage in self.stages if stage.last}
+        edges: dict[Any, DaskTask] = {
+            (stage.product.stage, name): DaskTask((stage.product.stage, name), len, *map(TaskRef, stage.sources[name]))
+            for stage in self.stages
+            for name in stage.tasks
+        }
+        place = order(edges)
+        units.sort(key=lambda source: (source[0] in last, place[source]))
+        return [set(units[first : first + size]) for first in range(0, len(units), size)]
+
+    def part(self, units: Set[Source], outputs: Mapping[Source, str]) -> UnitGraph:
+        """Return the graph of some units.
+
+        Parameters
+        ----------
+        units : set of Source
+            Units of the graph that is returned. They may wait for other units, whose tasks were submitted before.
+        outputs : mapping of Source to str
+            Output hashes of the units that have been made; no unit waits for them.
+        """
+        stages = []
+        for stage in self.stages:
+            names = [name for name in stage.tasks if (stage.product.stage, name) in units]
+            if names:
+                known = {name: _with_outputs(stage.tasks[name], stage.sources[name], outputs) for name in names}
+                tasks = {name: task for name, (task, _) in known.items()}
+                sources = {name: waiting for name, (_, waiting) in known.items()}
+                stages.append(replace(stage, tasks=tasks, sources=sources))
+        return replace(self, stages=stages)
 
     def __dask_keys__(self) -> list[Key]:
         units = [self.key((stage.product.stage, name)) for stage in self.stages for name in stage.tasks]
@@ -149,6 +203,20 @@ class UnitGraph(DaskMethodsMixin):
 
     def __dask_postpersist__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return partial(_persisted, self), ()
+
+
+def _with_outputs(
+    task: Task, sources: tuple[Source, ...], outputs: Mapping[Source, str]
+) -> tuple[Task, tuple[Source, ...]]:
+    """Return a task in which the outputs of units that have been made are known, and the units it still waits for."""
+    if not any(source in outputs for source in sources):
+        return task, sources
+    waiting = iter(sources)
+    unknown = []
+    for stage, known in task.unknown:
+        found = [outputs.get(next(waiting)) if output is None else output for output in known]
+        unknown.append((stage, tuple(found)))
+    return replace(task, unknown=tuple(unknown)), tuple(source for source in sources if source not in outputs)
 
 
 _BEGIN = threading.Lock()

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 
-from romandask.engine.clients import Ended, Runner
 from romandask.engine.event_log import Log
 from romandask.engine.graph import StageUnits, UnitGraph
 from romandask.engine.lost_units import Lost
 from romandask.engine.progress import Board, Meter, Reporter
+from romandask.engine.runners import Ended, Runner
 from romandask.engine.staleness import (
     Source,
     Staleness,

@@ -17,8 +17,9 @@ import cdshealpix.nested as healpix
 import numpy as np
 import pandas as pd
 
-from romandask.engine.clients import Ended, runner
+from romandask.engine.clients import runner
 from romandask.engine.graph import UnitGraph
+from romandask.engine.runners import Ended
 from romandask.kernels.measurement.groups import forest, label, links
 from romandask.model.seeds import rng
 from romandask.model.settings import MatchSettings

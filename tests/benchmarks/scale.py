@@ -20,10 +20,11 @@ from rich.console import Console
 
 from romandask import run as running
 from romandask.engine import run_stages
-from romandask.engine.clients import Ended, Runner, runner
+from romandask.engine.clients import runner
 from romandask.engine.graph import StageUnits, UnitGraph
 from romandask.engine.lost_units import Lost
 from romandask.engine.progress import Reporter
+from romandask.engine.runners import Ended, Runner
 from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct

@@ -18,8 +18,8 @@ import dask
 import yaml
 from distributed import Client, LocalCluster
 
-from romandask.engine.clients import Ended, OnCluster
 from romandask.engine.graph import UnitGraph
+from romandask.engine.runners import Ended, OnCluster
 from romandask.model.resources import resource_folder
 from romandask.products.units import Made
 from romandask.storage.manifest import read_records

@@ -16,9 +16,10 @@ import pytest
 from distributed import Client, LocalCluster
 
 from romandask.engine import clients
-from romandask.engine.clients import Ended, runner
+from romandask.engine.clients import runner
 from romandask.engine.graph import RETRIES, UnitGraph
 from romandask.engine.lost_units import Lost
+from romandask.engine.runners import Ended
 from romandask.model.errors import UserError
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit

@@ -19,8 +19,9 @@ from output_hashes import output_hashes
 from rich.console import Console
 
 from romandask import run as running
-from romandask.engine.clients import InProcess, runner
+from romandask.engine.clients import runner
 from romandask.engine.progress import Reporter
+from romandask.engine.runners import InProcess
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
 from romandask.stage_graph import Selection

@@ -13,10 +13,11 @@ from conftest import MINI
 from rich.console import Console
 
 from romandask import run as running
-from romandask.engine.clients import InProcess, runner
+from romandask.engine.clients import runner
 from romandask.engine.event_log import Log, events
 from romandask.engine.progress import Reporter
 from romandask.engine.run_stages import Run, RunnableStage, run_stages
+from romandask.engine.runners import InProcess
 from romandask.model.errors import UserError
 from romandask.pipeline import load_pipeline
 from romandask.products.images import ImageProduct

@@ -8,8 +8,8 @@ from output_hashes import output_hashes
 from rich.console import Console
 from third_instrument import WithThird
 
-from romandask.engine.clients import InProcess
 from romandask.engine.progress import Reporter
+from romandask.engine.runners import InProcess
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.model.settings import apply_overrides, read_yaml, validate

@@ -17,9 +17,9 @@ from hats.io.validation import is_valid_catalog, is_valid_collection
 from hats.loaders import read_hats
 from rich.console import Console
 
-from romandask.engine.clients import InProcess
 from romandask.engine.graph import UnitGraph
 from romandask.engine.progress import Reporter
+from romandask.engine.runners import InProcess
 from romandask.export.truth import export_truth
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError

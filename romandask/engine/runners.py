@@ -256,5 +256,7 @@ def _failure_text(future: Any, error: BaseException | None) -> str:
     if error is None:
         return f"the task was {future.status}\n"
     if type(error).__name__ == "KilledWorker":
-        return f"its worker died {error.allowed_failures + 1} times, perhaps for want of memory\n{error}\n"
+        return (
+            f"its worker died {getattr(error, 'allowed_failures', 0) + 1} times, perhaps for want of memory\n{error}\n"
+        )
     return "".join(traceback.format_exception(type(error), error, future.traceback()))

@@ -112,13 +112,14 @@ def test_stages_without_a_finished_unit_are_printed_repeatedly(monkeypatch):
     console = Console(file=io.StringIO(), width=200)
     with Reporter(console).board() as board:
         meter, other = board.begin("coadds/roman", 2, 3.0), board.begin("truth_index/roman", 3, 3.0)
-        wait_for("0/2 units", console)
-        wait_for("0/3 units", console)
+        board.expect(5, 6.0)
+        wait_for("all stages           0/5 units", console)
+        wait_for("coadds/roman 0/2, truth_index/roman 0/3", console)
         meter.advance(2.0)
         meter.advance(1.0)
         ended = console.file.getvalue()
         assert "2/2 units" in ended
-        wait_for("0/3 units", OutputSince(console, len(ended)))
+        wait_for("truth_index/roman 0/3", OutputSince(console, len(ended)))
         assert "coadds" not in console.file.getvalue()[len(ended) :], "a finished stage is not printed again"
         for _ in range(3):
             other.advance(1.0)
@@ -128,6 +129,7 @@ def test_stages_without_a_finished_unit_are_printed_repeatedly(monkeypatch):
 def test_active_stages_have_bars_and_finished_stages_have_lines():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
     with Reporter(console).board() as board:
+        board.expect(5, 6.0)
         meter, other = board.begin("coadds/roman", 2, 3.0), board.begin("truth_index/roman", 3, 3.0)
         meter.advance(2.0)
         meter.advance(1.0)

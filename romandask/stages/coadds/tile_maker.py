@@ -13,6 +13,7 @@ from romandask.instruments.instrument import Instrument
 from romandask.model.settings import CoaddSettings, RenderSettings
 from romandask.model.tiles import Tile
 from romandask.products.image_set import ImageSet
+from romandask.products.mosaic import Mosaic
 from romandask.stages.exposures.exposures import Exposures
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
 
@@ -70,11 +71,6 @@ class TileMaker:
     def wcs(self, tile: int) -> WCS:
         """Return the WCS of the tile with an index."""
         return WCS(self.header(tile))
-
-
-def unit_of(tile: int, band: str, bands: tuple[str, ...]) -> int:
-    """Return the index of the unit of a tile (by index) and band; the units of a tile are in the order of `bands`."""
-    return tile * len(bands) + bands.index(band)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -136,9 +132,13 @@ class Coadds(ImageSet):
         """Layers of cutouts that are not stored: none."""
         return {}
 
-    def index(self, tile: int, band: str) -> int:
-        """Return the index of the unit of a tile (by index) and band."""
-        return unit_of(tile, band, self.instrument.bands)
+    def index(self, tile: int, band: str, *patch: int) -> int:
+        """Return the index of the unit of a tile (by index), a band and the row and column of a patch."""
+        return self.product.layout.unit(tile, self.instrument.bands.index(band), *patch)
+
+    def tile_image(self, tile: int, band: str) -> Mosaic:
+        """Return a reader of windows of a tile (by index) in a band, across its patches."""
+        return self.image(tile, self.instrument.bands.index(band))
 
     def tile_band(self, index: int) -> TileBand:
         """Return the tile and band of the unit with an index."""

@@ -22,7 +22,10 @@ from romandask.storage.paths import OPTIONS, AnyPath
 
 ROWS_A_FILE = 512
 """Approximate image rows per file of a variable that is not compressed."""
-_SHARD_CHUNKS = 4
+_CHUNK_PIXELS = 512
+"""Approximate side of an inner chunk of an image that is not divided into patches, pixels: coadds read windows of
+exposures, and decode the chunks that these touch."""
+_SHARD_CHUNKS = 8
 """Most inner chunks along each side of a shard."""
 PATCH_AXES = ("patch_y", "patch_x")
 """Names of the axes over the rows and the columns of the patches of an image."""
@@ -166,8 +169,8 @@ def _zarr_store(path: AnyPath) -> Any:
 def open_images(path: AnyPath, layout: Layout) -> zarr.Group:
     """Open the Zarr group of an image product, creating or resizing its arrays.
 
-    No two units, and so no two writers, share a shard. A shard consists of inner chunks of about 1k x 1k pixels, each
-    with a checksum; it has at most 4 x 4 of them, because several copies of a shard are in memory while it is written.
+    No two units, and so no two writers, share a shard. A shard consists of inner chunks of about 512 x 512 pixels, each
+    with a checksum; it has at most 8 x 8 of them, because several copies of a shard are in memory while it is written.
     Variables that are not compressed have no shards; their files hold about 512 full rows. An array that was created
     for another number of units is resized. One of another unit shape, chunk shape or type is replaced.
 
@@ -288,7 +291,7 @@ def _chunk_shapes(variable: Variable, patches: PatchGrid | None) -> tuple[tuple[
         return (*(1 for _ in planes), half, half), (*planes, 2 * half, 2 * half)
     if not variable.compress:
         return (*planes, *(chunk_side(length, ROWS_A_FILE) for length in image[:-1]), image[-1]), None
-    chunk = tuple(chunk_side(length) for length in image)
+    chunk = tuple(chunk_side(length, _CHUNK_PIXELS) for length in image)
     shard = (min(_SHARD_CHUNKS, -(-length // side)) * side for length, side in zip(image, chunk, strict=True))
     return (*(1 for _ in planes), *chunk), (*planes, *shard)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from romandask.kernels.detectors.simple_detector import SATURATED, Detector, noise_realisation, observe
+from romandask.kernels.detectors.simple_detector import SATURATED, Detector, observe
 from romandask.model.seeds import rng
 
 DETECTOR = Detector(saturation=1000.0, read_noise=8.5)
@@ -37,14 +37,3 @@ def test_negative_expected_values_give_a_finite_image():
 def test_the_same_seed_gives_the_same_image():
     pair = [observe(np.zeros((300, 50), np.float32), np.float32(9.0), DETECTOR, rng(4, "t", 7))[0] for _ in range(2)]
     np.testing.assert_array_equal(*pair)
-
-
-def test_a_noise_realisation_does_not_depend_on_the_requested_part():
-    def part(rows, columns):
-        shape = (rows.stop - rows.start, columns.stop - columns.start)
-        return noise_realisation(np.full(shape, 100 + 8.5**2, np.float32), 400, rows, columns, lambda k: rng(5, "n", k))
-
-    whole = part(slice(0, 700), slice(0, 400))
-    np.testing.assert_array_equal(whole[300:600, 37:90], part(slice(300, 600), slice(37, 90)))
-    assert whole.std() == pytest.approx(np.sqrt(100 + 8.5**2), rel=0.01)
-    assert whole.mean() == pytest.approx(0, abs=0.1)

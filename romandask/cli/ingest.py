@@ -7,16 +7,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from romandask import run as running
 from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_path
-from romandask.engine.clients import runner
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
-from romandask.model.settings import read_yaml
-from romandask.pipeline import instrument_types, pipeline_of
 from romandask.storage.paths import AnyPath, resolve_below
-from romandask.storage.store import Store
-from romandask.survey import Survey
 
 ingest_app = typer.Typer(no_args_is_help=True, help="Convert a real catalog into the truth catalogs of a store.")
 
@@ -68,6 +62,8 @@ def table(
     workers: Workers = 0,
 ) -> None:
     """Convert Parquet or FITS tables, with a map of their columns."""
+    from romandask.model.settings import read_yaml
+
     sections = read_yaml(columns)
     unknown = sorted(set(sections) - {"galaxies", "stars"})
     if unknown or not sections:
@@ -86,6 +82,12 @@ def table(
 def _ingest(
     source: AnyPath, truth: dict[str, Any], store: AnyPath, seds: AnyPath | None, order: int, workers: int | None
 ) -> None:
+    from romandask import run as running
+    from romandask.engine.clients import runner
+    from romandask.pipeline import instrument_types, pipeline_of
+    from romandask.storage.store import Store
+    from romandask.survey import Survey
+
     content = {
         "name": "ingest",
         "seed": 0,

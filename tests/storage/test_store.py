@@ -1,6 +1,5 @@
 """Products, records and locks of a store: what is written is read back, and damage is detected."""
 
-import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct, conform
 from romandask.products.units import LazyUnits, Unit, names_of
 from romandask.storage.arrays import Variable
-from romandask.storage.lock import locked
 from romandask.storage.manifest import Record, digest, read_record, write_record
 from romandask.storage.paths import write_bytes
 from romandask.storage.store import Store, read_parquet, write_parquet
@@ -169,21 +167,6 @@ def test_the_lazy_table_has_the_rows_of_all_units(tmp_path):
         stage="t", units=(Unit("0", 0), Unit("1", 1)), make=lambda k: pd.DataFrame({"a": [k, k + 10]}), schema=schema
     )
     assert product.frame.compute(scheduler="synchronous")["a"].tolist() == [0, 10, 1, 11]
-
-
-def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(tmp_path):
-    with locked(tmp_path):
-        holder = json.loads((tmp_path / ".lock").read_text())
-        (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 1}))
-        with pytest.raises(UserError, match="another driver"), locked(tmp_path):
-            pass
-    (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 2**22 + 1}))
-    with locked(tmp_path):
-        assert (tmp_path / ".lock").exists()
-    assert not (tmp_path / ".lock").exists()
-    (tmp_path / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
-    with pytest.raises(UserError, match="elsewhere"), locked(tmp_path):
-        pass
 
 
 def test_a_store_that_cannot_be_written_is_refused(tmp_path):

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_path
+from romandask.cli.interrupts import resumable
+from romandask.cli.options import Order, Spectra, StoreOption, Workers, source_path
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath, resolve_below
@@ -79,6 +80,7 @@ def table(
     _ingest(columns, content, store, seds, order, workers)
 
 
+@resumable()
 def _ingest(
     source: AnyPath, truth: dict[str, Any], store: AnyPath, seds: AnyPath | None, order: int, workers: int | None
 ) -> None:
@@ -101,6 +103,6 @@ def _ingest(
     survey.output("truth/ingested")
     Store(store).prepare()
     reporter = Reporter(Console())
-    with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
+    with runner(workers or 0, settings.run.memory_limit) as execution:
         counts = running.ingest(survey, execution, reporter)
     reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")

@@ -24,7 +24,8 @@ from romandask import __version__  # noqa: E402
 from romandask.cli.calibration import calibration_app  # noqa: E402
 from romandask.cli.export import export_app  # noqa: E402
 from romandask.cli.ingest import ingest_app  # noqa: E402
-from romandask.cli.options import Scheduler, StoreOption, Workers, resumable  # noqa: E402
+from romandask.cli.interrupts import resumable  # noqa: E402
+from romandask.cli.options import Scheduler, StoreOption, Workers  # noqa: E402
 from romandask.engine.progress import Reporter, busy, duration  # noqa: E402
 from romandask.export import sha256sums  # noqa: E402
 from romandask.export.options import Overrides, Source, StoreArgument  # noqa: E402
@@ -111,6 +112,7 @@ def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
 
 
 @app.command()
+@resumable()
 def run(
     pipeline: Source,
     store: StoreOption,
@@ -156,7 +158,7 @@ def run(
         return
     start_time = time.monotonic()
     count = settings.run.workers if workers is None else workers
-    with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
+    with runner(count, settings.run.memory_limit, scheduler) as execution:
         Store(store).prepare()
         hours = sum(row.hours for row in planned)
         reporter.say(f"{settings.name}: {execution.description}")

@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as _numpy  # noqa: F401
 import scipy.linalg as _linalg  # noqa: F401
@@ -32,7 +33,8 @@ def _choose_cache() -> None:
         from numba.core.dispatcher import Dispatcher  # noqa: PLC0415
 
         # nothing can be written: every process compiles what it needs
-        Dispatcher.enable_caching = lambda dispatcher: None
+        dispatcher_class: Any = Dispatcher
+        dispatcher_class.enable_caching = lambda dispatcher: None
         return
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:

@@ -14,6 +14,7 @@ from zarr.abc.store import ByteRequest
 from zarr.abc.store import Store as ZarrStore
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from romandask.model.errors import UserError
@@ -135,7 +136,8 @@ def limited_concurrency() -> Any:
 def write_array(array: zarr.Array[Any], unit_index: tuple[int, ...], values: np.ndarray) -> None:
     """Write the values of one unit, one file of its last two axes at a time.
 
-    Zarr holds a second copy of the values that it writes, so one file at a time bounds the memory.
+    Zarr holds a second copy of the values that it writes, so one file at a time bounds the memory. An earlier file is
+    removed first: Zarr would read it, also where every value of it is written, and fail if it is damaged.
 
     Parameters
     ----------
@@ -152,8 +154,16 @@ def write_array(array: zarr.Array[Any], unit_index: tuple[int, ...], values: np.
     starts = [range(0, length, step) for length, step in zip(values.shape[-2:], file_shape[-2:], strict=True)]
     for corner in itertools.product(*starts):
         window: Any = (..., *(slice(low, low + step) for low, step in zip(corner, file_shape[-2:], strict=True)))
+        planes = (0,) * (values.ndim - 2)
+        rows_and_columns = (low // step for low, step in zip(corner, file_shape[-2:], strict=True))
+        _remove_file(array, (*unit_index, *planes, *rows_and_columns))
         with limited_concurrency():
             array[(*unit_index, *window)] = values[window]
+
+
+def _remove_file(array: zarr.Array[Any], file_index: tuple[int, ...]) -> None:
+    """Remove a file (shard, or chunk without shards) of an array, given its indices in the grid of files."""
+    sync((array.store_path / array.metadata.encode_chunk_key(file_index)).delete())
 
 
 def write_coordinate(

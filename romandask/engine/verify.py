@@ -56,8 +56,8 @@ def verify(stages: list[RunnableStage], store: Store, only: str | None = None) -
         except Exception as error:
             # its units follow from products that are damaged too, which were verified before
             sources = ", ".join(sorted(stage.known_after))
-            damage = f"cannot be verified before {sources} is made again ({type(error).__name__})"
-            yield Verified(stage.name, len(records), ((ALL_UNITS, damage),))
+            reason = f"cannot be verified before {sources} is made again ({type(error).__name__})"
+            yield Verified(stage.name, len(records), ((ALL_UNITS, reason),))
             continue
         numbers = {name: index for index, name in enumerate(product.names)}
         for name, record in records.items():

@@ -45,13 +45,13 @@ class Variable:
 
 
 class _StrictStore(WrapperStore[ZarrStore]):
-    """A Zarr store in which a missing chunk is an error; Zarr itself would return zeros, which look like an image."""
+    """A Zarr store in which a missing or empty file is an error; Zarr would return zeros, which look like an image."""
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the bytes of a key, or None for missing metadata; raise FileNotFoundError for a missing chunk."""
+        """Return the bytes of a key, None for missing metadata; raise FileNotFoundError for a chunk without bytes."""
         content = await super().get(key, prototype, byte_range)
-        if content is None and _CHUNK_KEY.search(key):
-            raise FileNotFoundError(f"{self._store}/{key}: the chunk is gone")
+        if not content and _CHUNK_KEY.search(key):
+            raise FileNotFoundError(f"{self._store}/{key}: the chunk is {'gone' if content is None else 'empty'}")
         return content
 
 

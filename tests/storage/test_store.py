@@ -1,4 +1,4 @@
-"""Products, records and locks of a store: what is written is read back, and damage is detected."""
+"""Products and records of a store: what is written is read back, and damage is detected."""
 
 import pickle
 from dataclasses import replace
@@ -41,6 +41,40 @@ def image_product(count: int) -> ImageProduct:
         lengths=(count,),
         coordinates=lambda: coordinates,
     )
+
+
+TORN = (
+    Variable("shards", "float32", (5000, 8), ("y", "x"), {}),
+    Variable("planes", "int16", (2, 64, 48), ("plane", "y", "x"), {}),
+    Variable("files", "float32", (1100, 8), ("y", "x"), {}, compress=False),
+)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content), None],
+    ids=["truncated", "empty", "changed", "gone"],
+)
+def test_a_damaged_unit_is_written_again(tmp_path, damage):
+    """Zarr reads a shard before it writes it, and would fail."""
+    product = replace(
+        image_product(2),
+        make=lambda k: {v.name: np.random.default_rng(k).normal(size=v.shape) * 99 for v in TORN},
+        variables=TORN,
+    )
+    store, root = Store(tmp_path), tmp_path / "exposures" / "x.zarr"
+    product.prepare(store)
+    written = [product.write(index, store) for index in range(2)]
+    before = {path: path.read_bytes() for path in sorted(root.glob("*/c/**/*")) if path.is_file()}
+    own = [path for path in before if path.relative_to(root).parts[2] == "1" and path.parts[-3] != "exposure"]
+    assert len(own) == 2 + 1 + 2, "two shards, one of both planes, two files without shards"
+    for path in own:
+        path.unlink() if damage is None else path.write_bytes(damage(before[path]))
+        with pytest.raises(UserError, match="is damaged"):
+            product.stored(store).reader(1)(path.relative_to(root).parts[0])
+    assert product.write(1, store) == written[1]
+    assert {path: path.read_bytes() for path in before} == before
+    assert product.verify(1, store) == written[1].output
 
 
 def test_images_are_read_back_and_arrays_grow_with_the_number_of_units(tmp_path):

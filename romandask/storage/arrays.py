@@ -14,6 +14,7 @@ from zarr.abc.store import ByteRequest
 from zarr.abc.store import Store as ZarrStore
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from romandask.model.errors import UserError
@@ -142,13 +143,13 @@ def limited(window: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, .
 
 
 class _StrictStore(WrapperStore[ZarrStore]):
-    """A Zarr store in which a missing chunk is an error; Zarr itself would return zeros, which look like an image."""
+    """A Zarr store in which a missing or empty file is an error; Zarr would return zeros, which look like an image."""
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the bytes of a key, or None for missing metadata; raise FileNotFoundError for a missing chunk."""
+        """Return the bytes of a key, None for missing metadata; raise FileNotFoundError for a chunk without bytes."""
         content = await super().get(key, prototype, byte_range)
-        if content is None and _CHUNK_KEY.search(key):
-            raise FileNotFoundError(f"{self._store}/{key}: the chunk is gone")
+        if not content and _CHUNK_KEY.search(key):
+            raise FileNotFoundError(f"{self._store}/{key}: the chunk is {'gone' if content is None else 'empty'}")
         return content
 
 
@@ -235,7 +236,8 @@ def write_array(
 ) -> None:
     """Write the values of one unit, one file of its last two axes at a time.
 
-    Zarr holds a second copy of the values that it writes, so one file at a time bounds the memory.
+    Zarr holds a second copy of the values that it writes, so one file at a time bounds the memory. An earlier file is
+    removed first: Zarr would read it, also where every value of it is written, and fail if it is damaged.
 
     Parameters
     ----------
@@ -259,8 +261,16 @@ def write_array(
         ]
         own: Any = (..., *(slice(low, high) for low, high in zip(start, ends, strict=True)))
         stored: Any = [slice(first + low, first + high) for first, low, high in zip(corner, start, ends, strict=True)]
+        planes = (0,) * (values.ndim - 2)
+        rows_and_columns = (place.start // step for place, step in zip(stored, file_shape[-2:], strict=True))
+        _remove_file(array, (*unit_index, *planes, *rows_and_columns))
         with limited_concurrency():
             array[(*unit_index, ..., *stored)] = values[own]
+
+
+def _remove_file(array: zarr.Array[Any], file_index: tuple[int, ...]) -> None:
+    """Remove a file (shard, or chunk without shards) of an array, given its indices in the grid of files."""
+    sync((array.store_path / array.metadata.encode_chunk_key(file_index)).delete())
 
 
 def write_coordinate(

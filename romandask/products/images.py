@@ -167,13 +167,14 @@ class ImageProduct:
         return image_metadata_files(store, self.stage, [variable.name for variable in self.variables])
 
     def prepare(self, store: Store) -> None:
-        """Create the arrays that units are written into, and write the coordinates."""
+        """Create the arrays that units are written into, and write the coordinates; leave what is stored already."""
         if not self.units:
             return
         group = open_images(store.images(self.stage), self.layout)
         for name, (axes, values, attributes) in self.coordinates().items():
             write_coordinate(group, name, values, axes, attributes)
-        group.attrs.update(self.attributes)
+        if any(group.attrs.get(key) != value for key, value in self.attributes.items()):
+            group.attrs.update(self.attributes)
 
     def write(self, index: int, store: Store) -> Made:
         """Make one unit and write it. No other unit shares its shards, so units can be written concurrently."""

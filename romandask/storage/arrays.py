@@ -276,7 +276,12 @@ def _remove_file(array: zarr.Array[Any], file_index: tuple[int, ...]) -> None:
 def write_coordinate(
     group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict[str, Any]
 ) -> None:
-    """Write one coordinate array in a single chunk; strings are stored as variable-length UTF-8."""
+    """Write one coordinate array in a single chunk; strings are stored as variable-length UTF-8.
+
+    An array that is stored with the same values is left as it is, because others may be reading it.
+    """
+    if _has_coordinate(group, name, values, axes, attributes):
+        return
     text = values.dtype.kind in "OU"
     array = group.create_array(
         name,
@@ -289,6 +294,22 @@ def write_coordinate(
         overwrite=True,
     )
     array[...] = values.astype(object) if text else values
+
+
+def _has_coordinate(
+    group: zarr.Group, name: str, values: np.ndarray, axes: tuple[str, ...], attributes: dict[str, Any]
+) -> bool:
+    """Return whether a group has a coordinate with these values; a damaged one counts as missing."""
+    try:
+        array = group[name]
+        if not isinstance(array, zarr.Array) or array.shape != values.shape or dict(array.attrs) != attributes:
+            return False
+        stored = np.asarray(array[...])
+    except (KeyError, OSError, ValueError, RuntimeError, TypeError):
+        return False
+    kinds = ["text" if kind in "OUT" else kind for kind in (stored.dtype.kind, values.dtype.kind)]
+    same_names = getattr(array.metadata, "dimension_names", None) == axes
+    return same_names and kinds[0] == kinds[1] and np.array_equal(stored.astype(values.dtype), values)
 
 
 def _chunk_shapes(variable: Variable, patches: PatchGrid | None) -> tuple[tuple[int, ...], tuple[int, ...] | None]:

@@ -27,7 +27,8 @@ def running(folder: Path) -> subprocess.Popen:
         start_new_session=True,
     )
     for line in run.stdout:
-        if line.startswith("truth/"):
+        # the first units have been made
+        if line.startswith("pointings/"):
             break
     assert len(processes_of(run)) >= 3, "the driver and its workers"
     return run

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from romandask.stages.analysis.friends_of_friends import matches
     from romandask.stages.coadds.coadds import coadds
     from romandask.stages.cutouts import cutouts
-    from romandask.stages.detections.detections import detect_and_measure, detections
+    from romandask.stages.detections.detections import detections
     from romandask.stages.detections.field import ArrayField
+    from romandask.stages.detections.measure import detect_and_measure
     from romandask.stages.detections.objects import objects
     from romandask.stages.exposures.exposures import exposures
     from romandask.stages.pointings import pointings
@@ -35,7 +36,7 @@ _MODULES = {
     "UserError": "romandask.model.errors",
     "coadds": "romandask.stages.coadds.coadds",
     "cutouts": "romandask.stages.cutouts",
-    "detect_and_measure": "romandask.stages.detections.detections",
+    "detect_and_measure": "romandask.stages.detections.measure",
     "detections": "romandask.stages.detections.detections",
     "exposures": "romandask.stages.exposures.exposures",
     "load_pipeline": "romandask.pipeline",

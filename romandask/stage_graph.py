@@ -15,6 +15,7 @@ from romandask.stages.analysis.samples import LIMITS, SAMPLES
 from romandask.stages.analysis.shear import SHAPES, SHEAR, SHEAR_PAIRS
 from romandask.stages.calibration import CALIBRATION
 from romandask.stages.coadds.coadds import COADDS
+from romandask.stages.detections.coadd_noise import COADD_NOISE
 from romandask.stages.detections.detections import DETECTIONS
 from romandask.stages.detections.objects import OBJECTS
 from romandask.stages.detections.truth_match import TRUTH_MATCH, TRUTH_SUMMARY
@@ -37,6 +38,7 @@ STAGES: tuple[Stage, ...] = (
     CALIBRATION,
     EXPOSURES,
     COADDS,
+    COADD_NOISE,
     DETECTIONS,
     TRUTH_MATCH,
     TRUTH_SUMMARY,

@@ -282,7 +282,7 @@ class Survey:
         return coadd_psf(self._of("coadds", survey), ra, dec, band, stamp, scale, spectrum)
 
     def segmentation(self, survey: str) -> xr.Dataset:
-        """Return lazy segmentation maps, dims (tile, y, x): the last 24 bits of objectId, or 0 for no object."""
+        """Return lazy segmentation maps, dims (tile, y, x): the last 28 bits of objectId, or 0 for no object."""
         return self._of("detections", survey).dataset
 
     def differences(self) -> xr.Dataset:

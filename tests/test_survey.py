@@ -14,10 +14,11 @@ from romandask.export.truth import export_truth
 from romandask.ingest.spectra import galaxy_templates
 from romandask.instruments.exposure import exposure_of
 from romandask.instruments.rubin.depth import depth_map, visit_depth
-from romandask.kernels.measurement.extract import FLAGS
+from romandask.kernels.measurement.detected_objects import FLAGS
 from romandask.kernels.universe.galaxies import STEPS, TEMPLATES
 from romandask.model.sky import ARCSEC, unit_vectors
 from romandask.run import run_figures
+from romandask.stages.detections.detections import NUMBER_BITS
 from romandask.stages.exposures.exposures import wcs_of
 from romandask.stages.pointings import corners_of
 from romandask.storage.store import Store
@@ -244,8 +245,8 @@ def test_bright_objects_are_found_and_real(survey, name):
 
 def test_the_map_of_objects_has_the_objects_of_the_table(survey):
     segments = survey.segmentation("roman")["segmentation"].isel(tile=0).values
-    objects = survey.output("detections/roman").load(0, ("objects",))["objects"]
-    label = objects["objectId"].to_numpy() & 0xFFFFFF
+    objects = survey.output("detections/roman").tile_objects(0)
+    label = objects["objectId"].to_numpy() & ((1 << NUMBER_BITS) - 1)
     assert set(label) <= set(np.unique(segments))
     x, y = (np.rint(objects[name]).astype(int) for name in ("x", "y"))
     assert (segments[y, x] == label).mean() > 0.9

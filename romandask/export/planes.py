@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from romandask.kernels.detectors.simple_detector import Detector
-from romandask.kernels.measurement.measurement_image import errors, rms_of
+from romandask.kernels.measurement.measurement_image import errors
+from romandask.kernels.measurement.noise import rms_of
 from romandask.products.images import ImageProduct
 from romandask.stages.coadds.tile_maker import Coadds
 

@@ -8,6 +8,7 @@ the inner area.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,8 +84,8 @@ def tangent_header(ra: float, dec: float, pixels: int, scale: float) -> dict[str
 class PatchGrid:
     """The division of a square image into square patches.
 
-    Patches have an even number of pixels a side, so that each consists of 2 x 2 chunks. The last row and column of
-    patches may be narrower.
+    Patches have an even number of pixels a side, so that each consists of 2 x 2 or 4 x 4 chunks. The last row and
+    column of patches may be narrower.
     """
 
     pixels: int
@@ -128,6 +129,11 @@ class PatchGrid:
         """Return the name of a patch, which ends the names of units: r<row>c<column>."""
         return f"r{row}c{column}"
 
+    @staticmethod
+    def image_of(unit: str) -> str:
+        """Return the name of a unit without that of its patch, which it ends with unless the unit is a whole image."""
+        return re.sub(r"-r\d+c\d+$", "", unit)
+
 
 @dataclass(frozen=True)
 class TileGrid:
@@ -153,6 +159,11 @@ class TileGrid:
         ring = np.clip(np.floor((np.asarray(dec, float) + 90) / step), 0, self._rings - 1).astype(np.int64)
         column = np.floor((np.asarray(ra, float) % 360) / self._width(ring)).astype(np.int64)
         return ring * _RING_STRIDE + np.minimum(column, self._columns(ring) - 1)
+
+    def number(self, tile: Tile) -> int:
+        """Return the number of a tile among all tiles of the sky, which has fewer bits than its id."""
+        ring, column = divmod(tile.id, _RING_STRIDE)
+        return 2 * self._rings * ring + column
 
     def tile(self, tile_id: int) -> Tile:
         """Return the tile with an id."""

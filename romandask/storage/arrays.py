@@ -24,8 +24,8 @@ from romandask.storage.paths import OPTIONS, AnyPath
 ROWS_A_FILE = 512
 """Approximate image rows per file of a variable that is not compressed."""
 _CHUNK_PIXELS = 512
-"""Approximate side of an inner chunk of an image that is not divided into patches, pixels: coadds read windows of
-exposures, and decode the chunks that these touch."""
+"""Approximate side of an inner chunk, pixels: coadds read windows of exposures, and detection reads patches of coadds
+with a border; both decode the chunks that these touch."""
 _SHARD_CHUNKS = 8
 """Most inner chunks along each side of a shard."""
 PATCH_AXES = ("patch_y", "patch_x")
@@ -260,7 +260,8 @@ def write_array(
             min(low + step, length) for low, step, length in zip(start, file_shape[-2:], values.shape[-2:], strict=True)
         ]
         own: Any = (..., *(slice(low, high) for low, high in zip(start, ends, strict=True)))
-        stored: Any = [slice(first + low, first + high) for first, low, high in zip(corner, start, ends, strict=True)]
+        first = corner[-len(start) :]
+        stored: Any = [slice(origin + low, origin + high) for origin, low, high in zip(first, start, ends, strict=True)]
         planes = (0,) * (values.ndim - 2)
         rows_and_columns = (place.start // step for place, step in zip(stored, file_shape[-2:], strict=True))
         _remove_file(array, (*unit_index, *planes, *rows_and_columns))
@@ -319,7 +320,9 @@ def _chunk_shapes(variable: Variable, patches: PatchGrid | None) -> tuple[tuple[
         half = patches.side // 2
         if not variable.compress:
             return (*planes, half, 2 * half), None
-        return (*(1 for _ in planes), half, half), (*planes, 2 * half, 2 * half)
+        # a quarter of a large patch, which divides it if its side is a multiple of four
+        side = half // 2 if half % 2 == 0 and half > _CHUNK_PIXELS else half
+        return (*(1 for _ in planes), side, side), (*planes, 2 * half, 2 * half)
     if not variable.compress:
         return (*planes, *(chunk_side(length, ROWS_A_FILE) for length in image[:-1]), image[-1]), None
     chunk = tuple(chunk_side(length, _CHUNK_PIXELS) for length in image)

@@ -120,7 +120,8 @@ def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path):
     rows = [line.replace("│", " ").split() for line in done.stdout.splitlines() if "/" in line]
     units = {row[0]: int(row[1]) for row in rows}
     assert units["exposures/roman"] == pytest.approx(29153, rel=0.06)
-    assert units["detections/roman"] == pytest.approx(1039, rel=0.02)
+    assert units["coadd_noise/roman"] == pytest.approx(1039, rel=0.02)
+    assert units["detections/roman"] == 16 * units["coadd_noise/roman"], "patches"
     assert units["coadds/rubin"] == 6 * units["detections/rubin"]
     assert list(tmp_path.iterdir()) == []
     done = command("plan", "troxel2023", "run.memory_limit=1.8", cwd=tmp_path)

@@ -20,8 +20,8 @@ from romandask.survey import Survey
 
 TO_STATISTICS = Selection(
     (
-        *("truth", "pointings", "exposures", "coadds", "detections", "truth_match", "truth_summary", "zero_points"),
-        *("objects", "limits", "samples", "differences", "matches", "chance", "statistics"),
+        *("truth", "pointings", "exposures", "coadds", "coadd_noise", "detections", "truth_match", "truth_summary"),
+        *("zero_points", "objects", "limits", "samples", "differences", "matches", "chance", "statistics"),
     )
 )
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from threading import Lock
+from typing import Any
 
 import numpy as np
 import sep
 
-from romandask.kernels.measurement import psf_fit
-from romandask.kernels.measurement.apertures import aperture_sums, blendedness, kron_radii
-from romandask.kernels.measurement.measurement_image import MeasurementImage, pixel_values
+from romandask.kernels.measurement.apertures import blendedness, kron_radii
+from romandask.kernels.measurement.blends import deblend_each
+from romandask.kernels.measurement.detected_objects import NOT_DEBLENDED, WHOLE, DetectedObjects, Part, Window
+from romandask.kernels.measurement.measurement_image import MeasurementImage
 from romandask.kernels.measurement.peaks import find_peaks
+from romandask.kernels.measurement.photometry import ellipse_flux
 
 KRON_FACTOR, KRON_MIN = 2.5, 3.5
 """Radius of the Kron aperture: this many Kron radii, and at least this many semi-axes (PHOT_AUTOPARAMS of Source
@@ -18,64 +22,17 @@ Extractor)."""
 KRON_REACH, PEAK_KRON_REACH = 6.0, 3.5
 """Elliptical radius within which the Kron radius is measured, semi-axes: the value of Source Extractor for isophotes,
 and a smaller one for the larger segments of the PSF-smoothed image, beyond which there are neighbours and noise."""
-NOT_DEBLENDED, NO_DATA, SATURATED_CORE = 256, 512, 1024
-"""Bits of the flags column beyond those of sep."""
-FLAGS = {
-    "deblended": sep.OBJ_MERGED,
-    "truncated": sep.OBJ_TRUNC,
-    "deblend_overflow": sep.OBJ_DOVERFLOW,
-    "singular": sep.OBJ_SINGU,
-    "aperture_truncated": sep.APER_TRUNC,
-    "aperture_masked": sep.APER_HASMASKED,
-    "aperture_all_masked": sep.APER_ALLMASKED,
-    "kron_nonpositive": sep.APER_NONPOSITIVE,
-    "not_deblended": NOT_DEBLENDED,
-    "no_data": NO_DATA,
-    "saturated": SATURATED_CORE,
-}
-"""Bits of the flags column, by name: those of sep, then NOT_DEBLENDED, NO_DATA and SATURATED_CORE."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DetectedObjects:
-    """Objects of a detection image; all arrays are of shape (n,), positions 0 at the centre of the first pixel."""
-
-    label: np.ndarray
-    """Number in the segmentation map, from 1."""
-    x: np.ndarray
-    """x under a Gaussian window (XWIN), pixels."""
-    y: np.ndarray
-    """y under a Gaussian window (YWIN), pixels."""
-    barycentre_x: np.ndarray
-    """x of the barycentre of the isophote, the centre of the apertures, pixels."""
-    barycentre_y: np.ndarray
-    """y of the barycentre of the isophote, pixels."""
-    a: np.ndarray
-    """Semi-major axis, pixels."""
-    b: np.ndarray
-    """Semi-minor axis, pixels."""
-    theta: np.ndarray
-    """Angle of the major axis from the x axis, radians."""
-    x2: np.ndarray
-    """Second moment in x, pixels^2."""
-    y2: np.ndarray
-    """Second moment in y, pixels^2."""
-    xy: np.ndarray
-    """Mixed second moment, pixels^2."""
-    kron_radius: np.ndarray
-    """Radius of the Kron aperture, semi-axes."""
-    half_light_radius: np.ndarray
-    """Radius of the circle that holds half of the Kron flux, pixels; 1 where it cannot be measured."""
-    snr: np.ndarray
-    """Signal to noise: of the Kron flux (`detect`), or of a point source at the peak (`detect_peaks`)."""
-    blendedness: np.ndarray
-    """Share of the light at the object that belongs to its neighbours; NaN where there is no light."""
-    flags: np.ndarray
-    """Bits of FLAGS."""
+_SEP_LIMITS = Lock()
 
 
 def detect(
-    measurement: MeasurementImage, threshold: float, min_area: int, levels: int, contrast: float, min_snr: float
+    measurement: MeasurementImage,
+    threshold: float,
+    min_area: int,
+    levels: int,
+    contrast: float,
+    min_snr: float,
+    part: Part | None = None,
 ) -> tuple[DetectedObjects, np.ndarray]:
     """Detect objects as Source Extractor does: connected pixels above a threshold, deblended.
 
@@ -96,42 +53,49 @@ def detect(
         Smallest contrast of a deblended object (DEBLEND_MINCONT).
     min_snr : float
         Smallest signal to noise of the Kron flux of the objects that are kept.
+    part : Part, optional
+        Place of the detection image in a larger one; by default it is the whole image.
 
     Returns
     -------
     objects : DetectedObjects
     segments : ndarray, shape (ny, nx), int32
-        Number of the object in whose isophote a pixel lies, 0 for none; objects that are not kept included.
+        Number (`DetectedObjects.label`) of the object in whose isophote a pixel lies, 0 for none; objects that are not
+        kept or measured included.
     """
-    _raise_sep_limits()
     image, error, mask = measurement.image, measurement.error, measurement.mask
     error[mask] = 1.0
     # "conv" smooths the image and keeps the threshold in units of the noise of an unsmoothed pixel, as Source
     # Extractor does
-    options = {
-        "err": error,
-        "mask": mask,
-        "minarea": min_area,
-        "filter_type": "conv",
-        "clean": True,
-        "segmentation_map": True,
-    }
+    options = {"minarea": min_area, "filter_type": "conv", "segmentation_map": True}
     extra_flag = 0
+
+    def extract(window: Window, clean: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        planes = {name: np.ascontiguousarray(plane[window]) for name, plane in (("err", error), ("mask", mask))}
+        part = np.ascontiguousarray(image[window])
+        return _extract(
+            part, threshold, clean=clean, deblend_nthresh=levels, deblend_cont=contrast, **options, **planes
+        )
+
     try:
-        detected, segments = sep.extract(image, threshold, deblend_nthresh=levels, deblend_cont=contrast, **options)
+        detected, segments = extract(WHOLE, clean=True)
+        detected, segments = deblend_each(detected, segments, extract)
     except Exception as overflow:
         # sep raises a bare Exception: only its message distinguishes the causes
         if "deblending overflow" not in str(overflow) and "limit" not in str(overflow):
             raise
-        detected, segments = sep.extract(image, threshold, deblend_nthresh=levels, deblend_cont=1.0, **options)
+        detected, segments = _extract(image, threshold, err=error, mask=mask, clean=True, deblend_cont=1.0, **options)
         extra_flag = NOT_DEBLENDED
     error[mask] = 0.0
-    objects = _measure(measurement, detected, segments, min_snr=min_snr)
-    return replace(objects, flags=objects.flags | extra_flag), segments
+    part = part or whole(image)
+    inside = part.contains(detected["xpeak"], detected["ypeak"], image.shape)
+    objects = _measure(measurement, detected, segments, inside, min_snr=min_snr)
+    numbers = part.numbers(detected["xpeak"], detected["ypeak"])
+    return _numbered(replace(objects, flags=objects.flags | extra_flag), segments, numbers)
 
 
 def detect_peaks(
-    measurement: MeasurementImage, threshold: float, min_area: int, min_snr: float
+    measurement: MeasurementImage, threshold: float, min_area: int, min_snr: float, part: Part | None = None
 ) -> tuple[DetectedObjects, np.ndarray]:
     """Detect objects as peaks of the PSF-smoothed image.
 
@@ -142,21 +106,22 @@ def detect_peaks(
     ----------
     measurement, threshold, min_area, min_snr
         As in `peaks.find_peaks`.
+    part : Part, optional
+        As in `detect`.
 
     Returns
     -------
     objects : DetectedObjects
     segments : ndarray, shape (ny, nx), int32
-        Number of the object to whose peak a pixel belongs, 0 for none.
+        Number (`DetectedObjects.label`) of the object to whose peak a pixel belongs, 0 for none.
     """
-    _raise_sep_limits()
     peaks = find_peaks(measurement, threshold, min_area, min_snr)
     if not len(peaks.snr):
         fields = [*((name, float) for name in ("x", "y", "a", "b", "theta", "x2", "y2", "xy")), ("flag", int)]
-        return _measure(measurement, np.zeros(0, fields), peaks.segments), peaks.segments
+        return _measure(measurement, np.zeros(0, fields), peaks.segments, np.zeros(0, bool)), peaks.segments
     measurement.error[measurement.mask] = 1.0
     # moments of the image smoothed with the small default kernel, as in Source Extractor
-    detected, _ = sep.extract(
+    detected, _ = _extract(
         measurement.image,
         threshold,
         err=measurement.error,
@@ -167,25 +132,48 @@ def detect_peaks(
         segmentation_map=peaks.segments,
     )
     measurement.error[measurement.mask] = 0.0
-    objects = _measure(measurement, detected, peaks.segments, PEAK_KRON_REACH)
-    flags = objects.flags | np.where(peaks.touching, sep.OBJ_MERGED, 0).astype(np.int32)
-    return replace(objects, snr=peaks.snr.astype(float), flags=flags), peaks.segments
+    part = part or whole(measurement.image)
+    inside = part.contains(peaks.x, peaks.y, measurement.image.shape)
+    objects = _measure(measurement, detected, peaks.segments, inside, PEAK_KRON_REACH)
+    flags = objects.flags | np.where(peaks.touching[inside], sep.OBJ_MERGED, 0).astype(np.int32)
+    objects = replace(objects, snr=peaks.snr[inside].astype(float), flags=flags)
+    return _numbered(objects, peaks.segments, part.numbers(peaks.x, peaks.y))
 
 
-def _raise_sep_limits() -> None:
-    """Raise the limits of sep on the pixels and on the objects in one detection."""
-    sep.set_extract_pixstack(2_000_000)
-    sep.set_sub_object_limit(16_384)
+def whole(image: np.ndarray) -> Part:
+    """Return the part that is the whole of an image (ny, nx)."""
+    return Part(width=image.shape[1], x=0, y=0, inner=WHOLE)
+
+
+def _numbered(
+    objects: DetectedObjects, segments: np.ndarray, numbers: np.ndarray
+) -> tuple[DetectedObjects, np.ndarray]:
+    """Return objects and segmentation map with the running number k of an object replaced by numbers[k - 1]."""
+    numbers = np.concatenate([np.zeros(1, np.int32), numbers])
+    return replace(objects, label=numbers[objects.label]), numbers[segments]
+
+
+def _extract(image: np.ndarray, *arguments: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Call `sep.extract` with the limits of sep raised on the pixels and on the objects in one detection.
+
+    The limits are global in sep, so threads take turns. sep writes all pixels that the limit allows in each call:
+    the limit of a small image is small.
+    """
+    with _SEP_LIMITS:
+        sep.set_extract_pixstack(min(max(4 * image.size, 10_000), 2_000_000))
+        sep.set_sub_object_limit(16_384)
+        return sep.extract(image, *arguments, **options)
 
 
 def _measure(
     measurement: MeasurementImage,
     detected: np.ndarray,
     segments: np.ndarray,
+    inside: np.ndarray,
     reach: float = KRON_REACH,
     min_snr: float | None = None,
 ) -> DetectedObjects:
-    """Measure the objects that sep has detected, in the order of their numbers in the segmentation map.
+    """Measure some of the objects that sep has detected, in the order of their numbers in the segmentation map.
 
     Parameters
     ----------
@@ -195,17 +183,20 @@ def _measure(
         Objects as `sep.extract` returns them.
     segments : ndarray, shape (ny, nx), int32
         Segmentation map.
+    inside : ndarray of bool, shape (n,)
+        True for the objects to measure.
     reach : float, semi-axes
         Elliptical radius within which the Kron radius is measured.
     min_snr : float, optional
         Smallest signal to noise of the Kron flux of the objects that are returned; None for all objects.
     """
     image, mask = measurement.image, measurement.mask
+    label = np.flatnonzero(inside) + 1
+    detected = detected[inside]
     x, y, a, b, theta = (detected[name].astype(float) for name in ("x", "y", "a", "b", "theta"))
     # a line of pixels has no width: a least semi-axis keeps apertures defined
     a, b = np.maximum(np.nan_to_num(a), 0.3), np.maximum(np.nan_to_num(b), 0.3)
     theta = np.clip(np.nan_to_num(theta), -np.pi / 2, np.pi / 2)
-    label = np.arange(1, len(x) + 1, dtype=np.int64)
     radius = kron_radii(image, mask, segments, label, x, y, a, b, theta, reach)
     nonpositive = np.where(np.isfinite(radius), 0, sep.APER_NONPOSITIVE)
     radius = np.maximum(KRON_FACTOR * np.nan_to_num(radius), KRON_MIN)
@@ -216,9 +207,10 @@ def _measure(
     if min_snr is not None:
         keep = snr >= min_snr
         # most objects are noise, and the measurements below take most of the time
-        x, y, a, b, theta, label, radius, flux, snr, flag, detected = (
-            values[keep] for values in (x, y, a, b, theta, label, radius, flux, snr, flag, detected)
+        x, y, a, b, theta, label, radius, flux, snr, flag = (
+            values[keep] for values in (x, y, a, b, theta, label, radius, flux, snr, flag)
         )
+        detected = detected[keep]
     half, half_flag = sep.flux_radius(
         image, x, y, 6.0 * a + 5, 0.5, normflux=np.where(flux > 0, flux, 1.0), mask=mask, subpix=5
     )
@@ -243,121 +235,6 @@ def _measure(
         blendedness=blended,
         flags=(flag | half_flag).astype(np.int32),
     )
-
-
-def select(objects: DetectedObjects, keep: np.ndarray) -> DetectedObjects:
-    """Return the objects for which `keep`, (n,) bool, is True."""
-    return DetectedObjects(**{name: value[keep] for name, value in vars(objects).items()})
-
-
-def kron_fluxes(
-    measurement: MeasurementImage, segments: np.ndarray, objects: DetectedObjects
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fluxes of a band in the Kron apertures of the detection image, with neighbours replaced.
-
-    Parameters
-    ----------
-    measurement : MeasurementImage
-        The band.
-    segments : ndarray, shape (ny, nx)
-        Segmentation map of the detection image.
-    objects : DetectedObjects
-
-    Returns
-    -------
-    flux, error : ndarray, shape (n,)
-    flags : ndarray, shape (n,), int
-        Bits of FLAGS.
-    """
-    shape = (objects.a, objects.b, objects.theta, objects.kron_radius)
-    return ellipse_flux(measurement, segments, objects.label, objects.barycentre_x, objects.barycentre_y, *shape)
-
-
-def ellipse_flux(
-    measurement: MeasurementImage, segments, label, x, y, a, b, theta, r
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fluxes in elliptical apertures, with neighbours replaced.
-
-    The error includes the correlation of the noise and the Poisson noise of the sources. The former is the error for
-    white noise times the ratio measured in random apertures of the same area in the noise realisation.
-
-    Parameters
-    ----------
-    measurement : MeasurementImage
-    segments : ndarray, shape (ny, nx)
-        Segmentation map.
-    label : ndarray, shape (n,)
-        Number of each object in the map.
-    x, y, a, b : ndarray, shape (n,), pixels
-        Centres and semi-axes.
-    theta : ndarray, shape (n,), radians
-    r : ndarray, shape (n,), semi-axes
-        Elliptical radius of each aperture.
-
-    Returns
-    -------
-    flux, error : ndarray, shape (n,)
-    flags : ndarray, shape (n,), int
-        Bits of FLAGS.
-    """
-    if not len(x):
-        return np.empty(0), np.empty(0), np.empty(0, int)
-    flux, white, flag = aperture_sums(
-        measurement.image, measurement.error, measurement.mask, segments, label, x, y, a, b, theta, r
-    )
-    correlated = white * measurement.aperture_ratio(r * np.sqrt(a * b))
-    empty = pixel_values(measurement.mask, x, y)
-    return flux, np.sqrt(correlated**2 + measurement.source_variance(flux, x, y)), flag | np.where(empty, NO_DATA, 0)
-
-
-def aperture_fluxes(
-    measurement: MeasurementImage, segments: np.ndarray, objects: DetectedObjects, radius: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fluxes in circular apertures, corrected to the total flux of a point source.
-
-    The correction is the share of the light of the PSF image inside the circle. It does not depend on details of the
-    PSF within the circle.
-
-    Parameters
-    ----------
-    measurement, segments, objects
-        As in `kron_fluxes`.
-    radius : float, pixels
-        Radius of the circle.
-
-    Returns
-    -------
-    flux, error : ndarray, shape (n,)
-        NaN if the PSF has no light in the circle.
-    """
-    if not len(objects.x):
-        return np.empty(0), np.empty(0)
-    middle = (measurement.psf.shape[0] - 1) / 2
-    psf = np.ascontiguousarray(measurement.psf, dtype=np.float32)
-    share = float(sep.sum_circle(psf, [middle], [middle], radius, subpix=5)[0][0])
-    ones = np.ones(len(objects.x))
-    flux, error, _ = ellipse_flux(
-        measurement, segments, objects.label, objects.x, objects.y, ones, ones, 0 * ones, radius * ones
-    )
-    if not share > 0:
-        return np.full(len(flux), np.nan), np.full(len(flux), np.nan)
-    return flux / share, error / share
-
-
-def psf_fluxes(measurement: MeasurementImage, objects: DetectedObjects) -> tuple[np.ndarray, np.ndarray]:
-    """Return flux and error, (n,), of objects as point sources, from unweighted fits of the PSF in a window."""
-    flux, norm = psf_fit.fit(measurement.image, measurement.psf, objects.x, objects.y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        white = np.where(norm > 0, pixel_values(measurement.error, objects.x, objects.y) / np.sqrt(norm), np.nan)
-    return flux, np.sqrt((white * measurement.psf_ratio) ** 2 + measurement.source_variance(flux, objects.x, objects.y))
-
-
-def psf_half_light_radius(psf: np.ndarray) -> float:
-    """Return the radius, pixels, that holds half the light of a PSF image."""
-    middle = (psf.shape[0] - 1) / 2
-    image = np.ascontiguousarray(psf, dtype=np.float32)
-    radius, _ = sep.flux_radius(image, [middle], [middle], [middle], 0.5, subpix=5)
-    return float(radius[0])
 
 
 def _windowed(

@@ -6,14 +6,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-import sep
 
 NOISE_RADII = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 14.0, 20.0])
 """Radii of the apertures in which the correlation of the noise is measured, pixels."""
-TRIALS = 2000
-"""Number of apertures of each radius."""
-_RMS_PIXELS = 4_000_000
-"""Approximate number of pixels from which the rms of the noise is measured."""
 
 
 @dataclass(frozen=True)
@@ -66,26 +61,6 @@ class MeasurementImage:
         return np.interp(radius, NOISE_RADII, self.aperture_ratios)
 
 
-def rms_of(noise: np.ndarray, weight: np.ndarray) -> float:
-    """Return the robust rms of a noise realisation times the square root of its weight.
-
-    Parameters
-    ----------
-    noise, weight : ndarray, shape (ny, nx)
-
-    Returns
-    -------
-    float
-        1.4826 times the median absolute deviation; 0 if no pixel has weight.
-    """
-    step = max(1, int(np.sqrt(noise.size / _RMS_PIXELS)))
-    sampled = weight[::step, ::step]
-    scaled = noise[::step, ::step][sampled > 0] * np.sqrt(sampled[sampled > 0])
-    if not len(scaled):
-        return 0.0
-    return float(1.4826 * np.median(np.abs(scaled - np.median(scaled))))
-
-
 def errors(weight: np.ndarray, rms: float) -> tuple[np.ndarray, np.ndarray]:
     """Convert a weight, in place, to the rms of a pixel.
 
@@ -94,7 +69,7 @@ def errors(weight: np.ndarray, rms: float) -> tuple[np.ndarray, np.ndarray]:
     weight : ndarray, shape (ny, nx), float32
         It is overwritten.
     rms : float
-        Rms of a pixel of unit weight (`rms_of`).
+        Rms of a pixel of unit weight (`noise.rms_of`).
 
     Returns
     -------
@@ -109,36 +84,6 @@ def errors(weight: np.ndarray, rms: float) -> tuple[np.ndarray, np.ndarray]:
     np.divide(np.float32(rms), weight, out=weight)
     weight[mask] = 0
     return weight, mask
-
-
-def noise_ratios(noise: np.ndarray, error: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the scatter of aperture fluxes in a noise realisation over that in white noise.
-
-    Parameters
-    ----------
-    noise, error, mask : ndarray, shape (ny, nx)
-        Noise realisation, rms of a pixel, and True for no data.
-
-    Returns
-    -------
-    ndarray, shape (len(NOISE_RADII),)
-        Ratio for each radius. For radii too large for the image, it is that of the largest radius that fits; 1
-        where too few apertures have data.
-    """
-    ratios = np.ones(len(NOISE_RADII))
-    ny, nx = noise.shape
-    # the positions only sample the realisation, so any fixed sequence is good enough
-    random = np.random.default_rng(0)
-    for k, radius in enumerate(NOISE_RADII):
-        if min(ny, nx) < 4 * radius:
-            ratios[k:] = ratios[max(k - 1, 0)]
-            break
-        x, y = (random.uniform(radius, n - 1 - radius, TRIALS) for n in (nx, ny))
-        flux, white, flag = sep.sum_circle(noise, x, y, radius, err=error, mask=mask, subpix=5)
-        good = (flag == 0) & (white > 0)
-        if good.sum() > 50:
-            ratios[k] = np.std(flux[good] / white[good])
-    return ratios
 
 
 def median(planes: list[np.ndarray], weights: list[np.ndarray]) -> np.ndarray:

@@ -22,6 +22,10 @@ class Peaks:
     """Number, from 1, of the peak to which a pixel belongs, (ny, nx) int32; 0 for none."""
     snr: np.ndarray
     """Signal to noise of a point source at each peak, (n,)."""
+    x: np.ndarray
+    """Column of the pixel of each peak, (n,)."""
+    y: np.ndarray
+    """Row of the pixel of each peak, (n,)."""
     touching: np.ndarray
     """True for peaks with pixels next to pixels of another peak, (n,)."""
 
@@ -50,7 +54,8 @@ def find_peaks(measurement: MeasurementImage, threshold: float, min_area: int, m
     number[1:][kept] = np.arange(1, kept.sum() + 1)
     inside = top > 0
     segments[inside] = number[1 + np.searchsorted(roots, top[inside])]
-    return Peaks(segments, height[kept], _touching(segments, int(kept.sum()))[1:])
+    y, x = np.divmod(roots[kept] - 1, smooth.shape[1])
+    return Peaks(segments, height[kept], x, y, _touching(segments, int(kept.sum()))[1:])
 
 
 def point_source_snr(measurement: MeasurementImage) -> np.ndarray:

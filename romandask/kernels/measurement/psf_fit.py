@@ -1,12 +1,10 @@
-"""Fits of the PSF to an image at many positions: fluxes of point sources, and their scatter in noise."""
+"""Fits of the PSF to an image at many positions: fluxes of point sources."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 from scipy import ndimage
-
-from romandask.kernels.measurement.measurement_image import TRIALS, pixel_values
 
 WINDOW_HALF_WIDTH = 12
 """Half the width of the window of a fit, pixels."""
@@ -37,31 +35,6 @@ def fit(image: np.ndarray, psf: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
     coefficients = ndimage.spline_filter(np.asarray(psf, float), order=5)
     padded = np.pad(np.pad(coefficients, _SPLINE_HALF_WIDTH, mode="reflect"), WINDOW_HALF_WIDTH + _SPLINE_HALF_WIDTH)
     return _fit(image, padded, len(psf), np.asarray(x, float), np.asarray(y, float))
-
-
-def scatter(noise: np.ndarray, psf: np.ndarray, error: np.ndarray) -> float:
-    """Return the scatter of fluxes from PSF fits to a noise realisation over that in white noise.
-
-    Parameters
-    ----------
-    noise : ndarray, shape (ny, nx)
-        Noise realisation.
-    psf : ndarray, shape (side, side)
-    error : ndarray, shape (ny, nx)
-        Rms of a pixel; 0 for no data.
-
-    Returns
-    -------
-    float
-        1 if there are too few pixels with data.
-    """
-    random = np.random.default_rng(0)
-    ny, nx = noise.shape
-    x, y = (random.uniform(WINDOW_HALF_WIDTH, n - 1 - WINDOW_HALF_WIDTH, TRIALS) for n in (nx, ny))
-    trial, norm = fit(noise, psf, x, y)
-    rms = pixel_values(error, x, y)
-    good = (rms > 0) & (norm > 0)
-    return float(np.std(trial[good] * np.sqrt(norm[good]) / rms[good])) if good.sum() > 50 else 1.0
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -20,7 +20,8 @@ from romandask.products.schemas import schema
 from romandask.products.units import Unit
 from romandask.stages.coadds.tile_maker import Coadds
 from romandask.stages.detections.detections import Detections
-from romandask.stages.detections.field import Field, tile_field
+from romandask.stages.detections.field import Field
+from romandask.stages.detections.tile_field import tile_field
 from romandask.stages.stage import Stage, SurveyContext
 from romandask.storage.arrays import Variable
 
@@ -59,7 +60,7 @@ def differences(
         tile = coadds.tiles[k].name
         bands = (templates, settings.template), (coadds, settings.science)
         images = ((each.stage, each.names[n]) for each, band in bands for n in each.units_of(k, band))
-        return Unit(tile, settings.model_dump(), (*images, (detections.stage, tile)))
+        return Unit(tile, settings.model_dump(), (*images, (detections.noise.stage, tile), *detections.inputs(k)))
 
     long_names = {
         "difference": f"{settings.science} less the matched {settings.template}",
@@ -99,10 +100,11 @@ class DifferTile:
 
     def __call__(self, index: int) -> dict[str, np.ndarray | pd.DataFrame]:
         """Return `difference`, `template` and `rms` (ny, nx), and the table `residuals`, of a tile."""
-        science = tile_field(self.coadds, index).measurement(self.settings.science)
+        noise = self.detections.noise.noise(index).bands[self.settings.science]
+        science = tile_field(self.coadds, index).measurement(self.settings.science, noise)
         template, unusable = self.template(index, "image")
         error = np.where(science.mask | unusable, np.float32(0), science.error)
-        bright = self.bright(self.detections.objects(index))
+        bright = self.bright(self.detections.tile_objects(index))
         x, y = (bright[name].to_numpy(float) for name in ("x", "y"))
         fit = match(science.image, template, error, x[:MAX_MATCHED_OBJECTS], y[:MAX_MATCHED_OBJECTS])
         matched = fit.image(template)
@@ -261,7 +263,7 @@ DIFFERENCES = Stage(
     per_survey=True,
     build=build_differences,
     exists=has_differences,
-    reads=("coadds/*", "detections"),
+    reads=("coadds/*", "coadd_noise", "detections"),
     units_known_after=("pointings/*", "truth/ingested"),
     unit="tile",
     summary="A band of one survey (Rubin's y) minus a band of a sharper survey (Roman's Y106) matched to its PSF, and "

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 
 from romandask.kernels.measurement.counts import counts_limit
-from romandask.kernels.measurement.extract import FLAGS
+from romandask.kernels.measurement.detected_objects import FLAGS
 from romandask.model.errors import UserError
 from romandask.model.settings import MatchSettings
 from romandask.model.spectra import ab_magnitude
+from romandask.model.tiles import PatchGrid
 from romandask.pipeline import instrument_types
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
@@ -92,7 +93,8 @@ def samples(
 
     def unit(index: int) -> Unit:
         # the counterpart of an object is in the truth_match table of its tile
-        tables = tuple((matched.stage, name) for _, name in objects.units[index].inputs if name in tiles)
+        names = dict.fromkeys(PatchGrid.image_of(name) for _, name in objects.units[index].inputs)
+        tables = tuple((matched.stage, name) for name in names if name in tiles)
         return Unit(
             objects.names[index], unit_settings, ((objects.stage, objects.names[index]), *tables, (limit.stage, "all"))
         )

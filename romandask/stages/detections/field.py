@@ -1,40 +1,44 @@
 """Fields: images of one area of the sky in one or more bands, from which objects are detected and measured.
 
-A field has, in each band, an image, its weight, a realisation of its noise and its PSF. Photometry holds one band in
-memory at a time; the detection image is made from small windows of all bands.
+A field has, in each band, an image, its weight, a realisation of its noise and its PSF. It may be a part of a larger
+image, whose noise is then measured once for all its parts. Photometry holds one band in memory at a time; the detection
+image is made from small windows of all bands.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from romandask.kernels.detectors.simple_detector import SATURATED
-from romandask.kernels.measurement import psf_fit
-from romandask.kernels.measurement.measurement_image import (
-    MeasurementImage,
-    errors,
-    median,
-    noise_ratios,
-    rms_of,
-    weighted_mean,
-)
-from romandask.model.spectra import NJY_ZERO_POINT
+from romandask.kernels.measurement.detected_objects import WHOLE
+from romandask.kernels.measurement.measurement_image import MeasurementImage, errors, median, weighted_mean
+from romandask.kernels.measurement.noise import Noise, measured_noise
 from romandask.products.memory import release_free_memory
-from romandask.products.mosaic import Mosaic
-from romandask.stages.coadds.tile_maker import Coadds
 from romandask.storage.arrays import chunk_side
 
 Window = tuple[slice, ...]
 """Rows and columns of an image."""
-WHOLE: Window = (slice(None), slice(None))
-"""Window that covers an image."""
 _CHUNKS = 3
 """Width, in chunks, of the windows of all bands that are in memory while the detection image is made."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldNoise:
+    """Noise of the bands and of the detection image of a field."""
+
+    bands: Mapping[str, Noise]
+    """Noise of each band."""
+    weights: Mapping[str, float]
+    """Median weight of each band, by which the weights of the bands are comparable."""
+    detection: Noise
+    """Noise of the detection image."""
+    psf: np.ndarray
+    """PSF of the detection image, of unit flux, (side, side)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,31 +77,33 @@ class Field(ABC):
             Rows and columns to return. `psf` is always returned whole.
         """
 
-    def measurement(self, band: str) -> MeasurementImage:
-        """Return the measurement image of a band.
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
 
-        Three images of the field are in memory while it is made, and two afterwards.
-        """
-        noise, weight = self.arrays(band, ("noise", "weight")).values()
-        rms = rms_of(noise, weight)
-        error, mask = errors(weight, rms)
-        ratios = noise_ratios(noise, error, mask)
-        psf = self.arrays(band, ("psf",))["psf"]
-        psf_ratio = psf_fit.scatter(noise, psf, error)
-        # make room for the image
-        del noise, weight
+    def strips(self) -> Iterator[Window]:
+        """Yield windows that cover the images and consist of whole chunks, so that no chunk is decoded twice."""
+        height, width = chunk_side(self.shape[0]), _CHUNKS * chunk_side(self.shape[1])
+        for top in range(0, self.shape[0], height):
+            for left in range(0, self.shape[1], width):
+                yield slice(top, top + height), slice(left, left + width)
+
+    def measurement(self, band: str, noise: Noise) -> MeasurementImage:
+        """Return the measurement image of a band, whose noise is given."""
+        error, mask = errors(self.arrays(band, ("weight",))["weight"], noise.rms)
         release_free_memory()
         exposures = None if self.weight_is_exposure_time else self.arrays(band, ("nimages",))["nimages"]
-        image = self.arrays(band, ("image",))["image"]
+        arrays = self.arrays(band, ("image", "psf"))
         return MeasurementImage(
-            image=image,
+            image=arrays["image"],
             error=error,
             mask=mask,
-            aperture_ratios=ratios,
-            psf=psf,
-            psf_ratio=psf_ratio,
+            aperture_ratios=noise.aperture_ratios,
+            psf=arrays["psf"],
+            psf_ratio=noise.psf_ratio,
             electrons_per_flux=self.electrons_per_njy[band],
-            rms=rms,
+            rms=noise.rms,
             exposure_map=exposures,
         )
 
@@ -105,66 +111,78 @@ class Field(ABC):
         """Return True, (ny, nx), for the saturated pixels of a band."""
         return (self.arrays(band, ("dq",))["dq"] & SATURATED) > 0
 
-    def detection(self) -> MeasurementImage:
+    def detection(self, noise: FieldNoise) -> MeasurementImage:
         """Return the detection image: the median of the detection bands, or their inverse-variance weighted mean."""
-        bands = self.detection_bands
-        median_weights, rms = [], []
-        for band in bands:
-            noise, weight = self.arrays(band, ("noise", "weight")).values()
-            rms.append(rms_of(noise, weight))
-            sampled = weight[::8, ::8]
-            median_weights.append(float(np.median(sampled[sampled > 0])) if (sampled > 0).any() else 0.0)
-            shape = weight.shape
-            del noise, weight, sampled
-        image, noise, total = (np.empty(shape, np.float32) for _ in range(3))
-        for window in _windows(shape):
-            planes = [self.arrays(band, ("image", "noise", "weight"), window) for band in bands]
-            weights = [arrays["weight"] for arrays in planes]
-            if self.method == "median":
-                image[window], noise[window] = (
-                    median([arrays[name] for arrays in planes], weights) for name in ("image", "noise")
-                )
-                # each weight in units of the median weight of its band
-                total[window] = sum(w / m for w, m in zip(weights, median_weights, strict=True) if m > 0) / len(bands)
-            else:
-                image[window], total[window] = weighted_mean([arrays["image"] for arrays in planes], weights, rms)
-                noise[window], _ = weighted_mean([arrays["noise"] for arrays in planes], weights, rms)
-        error, mask = errors(total, rms_of(noise, total))
-        psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in bands], axis=0)
+        image, total = self._all_combined("image", noise.bands, noise.weights)
+        error, mask = errors(total, noise.detection.rms)
         return MeasurementImage(
             image=image,
             error=error,
             mask=mask,
-            aperture_ratios=noise_ratios(noise, error, mask),
-            psf=psf,
-            psf_ratio=psf_fit.scatter(noise, psf, error),
+            aperture_ratios=noise.detection.aperture_ratios,
+            psf=noise.psf,
+            psf_ratio=noise.detection.psf_ratio,
         )
 
+    def combined(
+        self, name: str, window: Window, noise: Mapping[str, Noise], weights: Mapping[str, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return a window of an array, combined over the detection bands as in the detection image, and its weight.
 
-@dataclass(frozen=True, kw_only=True)
-class TileField(Field):
-    """One tile of a survey's coadds as a field."""
+        Parameters
+        ----------
+        name : str
+            `image` or `noise`.
+        window : tuple of slice
+        noise, weights
+            As in `FieldNoise`.
 
-    coadds: Coadds
-    """Coadds of the survey."""
-    tile: int
-    """Index of the tile."""
-    images: dict[str, Mosaic] = field(default_factory=dict)
-    """Readers of windows of the tile by band. They read the store, or the memory where a patch is not stored and was
-    made."""
+        Returns
+        -------
+        values, weight : ndarray, shape (ny, nx), float32
+        """
+        bands = self.detection_bands
+        planes = [self.arrays(band, (name, "weight"), window) for band in bands]
+        values, own = [arrays[name] for arrays in planes], [arrays["weight"] for arrays in planes]
+        if self.method == "peaks":
+            return weighted_mean(values, own, [noise[band].rms for band in bands])
+        # each weight in units of the median weight of its band
+        typical = [weights[band] for band in bands]
+        total = sum((w / m for w, m in zip(own, typical, strict=True) if m > 0), np.zeros_like(own[0])) / len(bands)
+        return median(values, own), total
 
-    def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
-        """Return arrays of a band, by name (see `Field.arrays`); `noise` is the first realisation."""
-        image = self.images.setdefault(band, self.coadds.tile_image(self.tile, band))
-        arrays = {}
-        for name in names:
-            if name == "psf":
-                arrays[name] = self.coadds.tile_psf(self.tile, band)
-            elif name == "noise":
-                arrays[name] = image(name, (slice(0, 1), *window))[0]
-            else:
-                arrays[name] = image(name, window)
-        return arrays
+    def _all_combined(
+        self, name: str, noise: Mapping[str, Noise], weights: Mapping[str, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return `combined` of the whole field, made in strips."""
+        values, total = (np.empty(self.shape, np.float32) for _ in range(2))
+        for window in self.strips():
+            values[window], total[window] = self.combined(name, window, noise, weights)
+        return values, total
+
+    def noise(self, windows: Sequence[Window] = ()) -> FieldNoise:
+        """Measure the noise of the bands and of the detection image.
+
+        Parameters
+        ----------
+        windows : sequence of tuple of slice
+            Windows, of one size, in which the noise is measured; by default the whole field.
+        """
+        bands, weights = {}, {}
+        for band in dict.fromkeys((*self.bands, *self.detection_bands)):
+            planes = [self.arrays(band, ("noise", "weight"), window) for window in windows or (WHOLE,)]
+            noise, weight = (_stacked([arrays[name] for arrays in planes]) for name in ("noise", "weight"))
+            del planes
+            sampled = weight[:, ::8, ::8]
+            weights[band] = float(np.median(sampled[sampled > 0])) if (sampled > 0).any() else 0.0
+            bands[band] = measured_noise(noise, weight, self.arrays(band, ("psf",))["psf"])
+            del noise, weight, sampled
+            release_free_memory()
+        psf = np.mean([self.arrays(band, ("psf",))["psf"] for band in self.detection_bands], axis=0)
+        parts = [self.combined("noise", window, bands, weights) for window in windows]
+        parts = parts or [self._all_combined("noise", bands, weights)]
+        noise, weight = (_stacked([part[k] for part in parts]) for k in (0, 1))
+        return FieldNoise(bands=bands, weights=weights, detection=measured_noise(noise, weight, psf), psf=psf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +191,12 @@ class ArrayField(Field):
 
     images: Mapping[str, Mapping[str, np.ndarray]]
     """Arrays by band and name (see `Field.arrays`). Without `dq`, no pixel is saturated."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        ny, nx = self.images[self.bands[0]]["image"].shape
+        return ny, nx
 
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
         """Return arrays of a band, by name (see `Field.arrays`)."""
@@ -183,36 +207,6 @@ class ArrayField(Field):
         return {name: array if name == "psf" else array[window].copy() for name, array in arrays.items()}
 
 
-def tile_field(coadds: Coadds, tile: int) -> TileField:
-    """Return a tile of a survey's coadds as a field, with the bands and the detection method of its instrument.
-
-    Parameters
-    ----------
-    coadds : Coadds
-    tile : int
-        Index of the tile.
-    """
-    instrument = coadds.instrument
-    drizzled = instrument.coadd == "drizzle"
-    electrons = {band: instrument.bandpass(band).ab_photons() / NJY_ZERO_POINT for band in instrument.bands}
-    if not drizzled:
-        electrons = {band: rate * instrument.visit_seconds for band, rate in electrons.items()}
-    return TileField(
-        bands=instrument.bands,
-        detection_bands=instrument.detection_bands or instrument.bands,
-        method=instrument.detection,
-        pixel_scale=instrument.coadd_scale,
-        aperture=instrument.aperture,
-        electrons_per_njy=electrons,
-        weight_is_exposure_time=drizzled,
-        coadds=coadds,
-        tile=tile,
-    )
-
-
-def _windows(shape: tuple[int, ...]) -> Iterator[Window]:
-    """Yield windows that cover an image (ny, nx) and consist of whole chunks, so that no chunk is decoded twice."""
-    height, width = chunk_side(shape[0]), _CHUNKS * chunk_side(shape[1])
-    for top in range(0, shape[0], height):
-        for left in range(0, shape[1], width):
-            yield slice(top, top + height), slice(left, left + width)
+def _stacked(planes: list[np.ndarray]) -> np.ndarray:
+    """Return planes (ny, nx) of one shape as one array (n, ny, nx); a single plane is not copied."""
+    return planes[0][None] if len(planes) == 1 else np.stack(planes)

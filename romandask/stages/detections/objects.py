@@ -1,4 +1,4 @@
-"""Object tables: the objects of all tiles as one HATS catalog, with fluxes corrected by the zero points."""
+"""Object tables: the objects of all patches as one HATS catalog, with fluxes corrected by the zero points."""
 
 from __future__ import annotations
 
@@ -20,43 +20,41 @@ def objects(detections: Detections, zero_points: TableProduct | None = None) -> 
     Parameters
     ----------
     detections : Detections
-        Detections of the survey; each object of each tile becomes one row.
+        Detections of the survey; each object of each patch becomes one row.
     zero_points : TableProduct, optional
         Offsets of the magnitudes (see `zero_points.zero_points`), which are removed; by default fluxes are left as
         measured.
     """
     settings = detections.settings
-    # more than half the diagonal of the unique area of a tile, degrees
-    radius = detections.coadds.settings.grid().inner / 3600 * 0.75
     cells = detections.region.cells(settings.order)
-    tiles_of: dict[int, list[int]] = {int(cell): [] for cell in cells}
-    for k, tile in enumerate(detections.tiles):
-        for cell in cells_in_cone(tile.ra, tile.dec, radius, settings.order):
-            if int(cell) in tiles_of:
-                tiles_of[int(cell)].append(k)
+    patches_of_cell: dict[int, list[int]] = {int(cell): [] for cell in cells}
+    for k, cone in enumerate(detections.cones()):
+        for cell in cells_in_cone(*cone, settings.order):
+            if int(cell) in patches_of_cell:
+                patches_of_cell[int(cell)].append(k)
     units = tuple(
         Unit(
             f"{settings.order}-{cell}",
             {"order": settings.order, "cell": cell},
             (
-                *((detections.stage, detections.names[k]) for k in tiles),
+                *((detections.stage, detections.names[k]) for k in patches),
                 *(((zero_points.stage, "all"),) if zero_points else ()),
             ),
         )
-        for cell, tiles in tiles_of.items()
+        for cell, patches in patches_of_cell.items()
     )
     return TableProduct(
         stage=f"objects/{detections.instrument.name}",
         units=units,
         make=CollectPartition(
             detections=detections,
-            cells=tuple(tiles_of),
-            tiles=tuple(map(tuple, tiles_of.values())),
+            cells=tuple(patches_of_cell),
+            patches=tuple(map(tuple, patches_of_cell.values())),
             order=settings.order,
             zero_points=zero_points,
         ),
         schema=detections.product.tables["objects"],
-        pixels=tuple(tiles_of),
+        pixels=tuple(patches_of_cell),
         order=settings.order,
         bytes_per_unit=400 << 20,
     )
@@ -64,13 +62,13 @@ def objects(detections: Detections, zero_points: TableProduct | None = None) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class CollectPartition:
-    """Makes one HEALPix partition of an object table from the tiles that overlap it."""
+    """Makes one HEALPix partition of an object table from the patches that overlap it."""
 
     detections: Detections
     cells: tuple[int, ...]
     """Nested HEALPix cell of each partition."""
-    tiles: tuple[tuple[int, ...], ...]
-    """Indices of the tiles that may overlap each partition."""
+    patches: tuple[tuple[int, ...], ...]
+    """Indices of the units of the detections, which are patches, that may overlap each partition."""
     order: int
     """HEALPix order of the partitions."""
     zero_points: TableProduct | None = None
@@ -78,7 +76,7 @@ class CollectPartition:
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the objects of a partition, sorted by _healpix_29."""
-        parts = [self.detections.objects(k) for k in self.tiles[index]]
+        parts = [self.detections.objects(k) for k in self.patches[index]]
         shift = 2 * (29 - self.order)
         parts = [part[part["_healpix_29"].to_numpy() >> shift == self.cells[index]] for part in parts]
         filled = [part for part in parts if len(part)]
@@ -100,8 +98,8 @@ OBJECTS = Stage(
     reads=("detections", "zero_points"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="HEALPix cell",
-    summary="The objects of all tiles in one catalog, each object once, with DPDD column names and fluxes corrected by "
-    "the zero points.",
+    summary="The objects of all patches in one catalog, each object once, with DPDD column names and fluxes "
+    "corrected by the zero points.",
     sky=("coord_ra", "coord_dec"),
     shrink_with="raise detections.order",
     tables={"objects": "objects/<survey>/"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ def truth_match(detections: Detections) -> TableProduct:
     instrument = detections.instrument
     units = _units(
         detections,
-        detections.stage,
+        detections.inputs,
         {"radius": detections.settings.match_radius, "band": instrument.reference_band},
     )
     return TableProduct(
@@ -57,7 +58,11 @@ def truth_summary(matched: TableProduct, detections: Detections) -> TableProduct
         Detections of the survey.
     """
     instrument, bands = detections.instrument, detections.instrument.bands
-    units = _units(detections, matched.stage, {"faintest": detections.settings.summary_magnitude, "bands": bands})
+
+    def inputs(tile: int) -> tuple[tuple[str, str], ...]:
+        return ((matched.stage, matched.names[tile]),)
+
+    units = _units(detections, inputs, {"faintest": detections.settings.summary_magnitude, "bands": bands})
     return TableProduct(
         stage=f"truth_summary/{instrument.name}",
         units=units,
@@ -116,7 +121,7 @@ class MatchTile:
         """Return one row per object (schema: catalogs/truth_match.yaml)."""
         detections = self.detections
         band = detections.instrument.reference_band
-        objects = detections.objects(index)
+        objects = detections.tile_objects(index)
         true = detections.truth.brief(*tile_cone(detections.coadds, index)[:3], (band,))
         magnitude = ab_magnitude(objects[f"{band}_kronFlux"])
         matched = counterparts(
@@ -170,11 +175,13 @@ class SummariseTile:
         return joined[schema("truth_summary", bands).names]
 
 
-def _units(detections: Detections, source: str, settings: dict[str, Any]) -> tuple[Unit, ...]:
-    """Return one unit per tile, which reads the unit of the tile in the stage `source` and the truth around it."""
+def _units(
+    detections: Detections, inputs: Callable[[int], tuple[tuple[str, str], ...]], settings: dict[str, Any]
+) -> tuple[Unit, ...]:
+    """Return one unit per tile, which reads the `inputs` of the tile with an index and the truth around it."""
     coadds, truth = detections.coadds, detections.truth
     return tuple(
-        Unit(tile.name, {"tile": tile.name, **settings}, ((source, tile.name), *truth.inputs(*tile_cone(coadds, k))))
+        Unit(tile.name, {"tile": tile.name, **settings}, (*inputs(k), *truth.inputs(*tile_cone(coadds, k))))
         for k, tile in enumerate(coadds.tiles)
     )
 

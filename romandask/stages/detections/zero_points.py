@@ -106,13 +106,13 @@ class MakeZeroPoints:
         measured = [f"{band}_{flux}" for band in self.bands for flux in FLUXES]
         parts = [pd.DataFrame(columns=[*true, *measured], dtype=float)]
         has_store = self.detections.product.store is not None
-        for k in range(len(self.detections.units)):
+        for k in range(len(self.detections.tiles)):
             # the units are optional inputs: with a store, those that failed are missing
-            if has_store and not (self.detections.has(k) and self.summary.has(k)):
+            if has_store and not (self.summary.has(k) and self.detections.has_tile(k)):
                 continue
             summary = self.summary.load(k)
             summary = summary[summary["star"] & (summary["objects"] == 1)]
-            objects = self.detections.objects(k)
+            objects = self.detections.tile_objects(k)
             objects = objects[objects["flags"] == 0]
             parts.append(summary[["objectId", *true]].merge(objects[["objectId", *measured]], on="objectId"))
         return offsets(pd.concat(parts, ignore_index=True), self.bands)

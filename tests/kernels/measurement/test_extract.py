@@ -13,23 +13,16 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from romandask.kernels.measurement import psf_fit
-from romandask.kernels.measurement.extract import (
-    FLAGS,
-    NOT_DEBLENDED,
-    DetectedObjects,
-    detect,
-    ellipse_flux,
-    kron_fluxes,
-    psf_fluxes,
-)
+from romandask.kernels.measurement.detected_objects import FLAGS, NOT_DEBLENDED, DetectedObjects
+from romandask.kernels.measurement.extract import detect
 from romandask.kernels.measurement.measurement_image import (
     MeasurementImage,
     errors,
     median,
-    noise_ratios,
-    rms_of,
     weighted_mean,
 )
+from romandask.kernels.measurement.noise import noise_ratios, rms_of, scatter
+from romandask.kernels.measurement.photometry import ellipse_flux, kron_fluxes, psf_fluxes
 
 SIDE, SEXTRACTOR = 1000, Path("/usr/share/source-extractor")
 
@@ -59,7 +52,7 @@ def measurement_of(image: np.ndarray, noise: np.ndarray, weight: np.ndarray) -> 
         image=image,
         error=error,
         mask=mask,
-        aperture_ratios=noise_ratios(noise, error, mask),
+        aperture_ratios=noise_ratios(noise[None], error[None], mask[None]),
         psf=ndimage.gaussian_filter(psf, 1.3),
     )
 
@@ -137,7 +130,7 @@ def test_errors_agree_with_the_scatter_in_correlated_noise():
     weight[:, : SIDE // 2] = 2.0
     noise, other = (np.asarray(plane / np.sqrt(weight), np.float32) for plane in (noise, other))
     measurement = measurement_of(other, noise, weight)
-    measurement = replace(measurement, psf_ratio=psf_fit.scatter(noise, measurement.psf, measurement.error))
+    measurement = replace(measurement, psf_ratio=scatter(noise[None], measurement.psf, measurement.error[None]))
     x, y = random.uniform(40, SIDE - 40, (2, 3000))
     for radius in (2.0, 5.0, 11.0):
         ones, no_segments = np.ones(len(x)), np.zeros((SIDE, SIDE), np.int32)

@@ -68,7 +68,11 @@ def test_noise_alone_has_no_peaks_of_five_sigma_and_faint_stars_are_found():
     assert objects.flags.max() & 1 == 0
     nearest = np.array([np.hypot(objects.x - x, objects.y - y).min() for x, y in positions])
     assert np.median(nearest) < 0.6
-    assert np.unique(segments[segments > 0]).tolist() == list(range(1, segments.max() + 1))
+    assert np.unique(segments[segments > 0]).tolist() == objects.label.tolist()
+    # an object has the number of the pixel of its peak
+    row, column = np.divmod(objects.label - 1, shape[1])
+    assert (segments[row, column] == objects.label).all()
+    assert np.hypot(column - objects.x, row - objects.y).max() < 3
 
 
 def test_pixels_belong_to_the_peak_uphill_of_them():

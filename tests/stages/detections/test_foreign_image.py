@@ -7,7 +7,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 import romandask as rd
-from romandask.kernels.measurement.extract import FLAGS
+from romandask.kernels.measurement.detected_objects import FLAGS
 from romandask.model.settings import DetectionSettings
 from romandask.model.tiles import tangent_header
 

@@ -41,6 +41,9 @@ class Variable:
     """Zarr attributes: units, long_name, ..."""
     compress: bool = True
     """False where compression would gain little and slow down every reader; each chunk is then a file of full rows."""
+    zeros: bool = False
+    """True for a variable that is not compressed but has large areas of zeros, which are then stored as almost nothing
+    (LZ4, which copies other values as they are)."""
 
 
 class _StrictStore(WrapperStore[ZarrStore]):
@@ -108,6 +111,8 @@ def open_images(
                 continue
         ones = (1,) * len(lengths)
         packing = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")] if variable.compress else []
+        if variable.zeros:
+            packing = [BloscCodec(cname="lz4", clevel=1, shuffle="noshuffle")]
         chunk, shard = _chunk_shapes(variable)
         group.create_array(
             variable.name,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.exposure import EXPOSURE_COLUMNS
+from romandask.instruments.exposure import EXPOSURE_COLUMNS, exposures_of
 from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.model.settings import CoaddSettings
 from romandask.model.sky import touching_pairs
@@ -75,6 +75,7 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
         # the length of the arrays of all tiles is that of the tile with most exposures: if it changes, all are remade
         shared["inputs"] = most_inputs(members)
     keys = tuple(members)
+    all_exposures = exposures_of(table)
 
     def unit(index: int) -> Unit:
         (k, band), chosen = keys[index], members[keys[index]]
@@ -84,7 +85,8 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
             inputs = renderer.truth.inputs(*cone(footprints[k]))
         else:
             unit_settings["exposures"] = names[chosen].tolist()
-            inputs = tuple((exposures.stage, name) for name in names[chosen])
+            psf_units = dict.fromkeys(source for row in chosen for source in renderer.psfs.inputs(all_exposures[row]))
+            inputs = (*((exposures.stage, name) for name in names[chosen]), *psf_units)
         return Unit(name=f"{tiles[k].name}-{band}", settings=unit_settings, inputs=inputs, cost=1.0 + len(chosen))
 
     def coordinates() -> Coordinates:
@@ -214,7 +216,7 @@ COADDS = Stage(
     name="coadds",
     per_survey=True,
     build=build_coadds,
-    reads=("exposures", "truth/galaxies", "truth/stars"),
+    reads=("exposures", "psf_models", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="tile and band",
     summary="Image, weight, noise, number and sets of exposures, and PSFs of a tile, drizzled from exposures (square "

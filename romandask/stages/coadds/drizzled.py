@@ -42,11 +42,12 @@ class DrizzleTile(TileMaker):
         headers = [instrument.header(exposure) for exposure in exposures]
         frames = [WCS(header) for header in headers]
         strips_of = [strips(frame, instrument.shape, target, shape) for frame in frames]
+        sampled = self.exposures.renderer.psfs
         # PSFs are sampled before the sums are allocated, because sampling needs memory of its own
         psfs = np.zeros((most_inputs(self.members), *[psf_side(instrument)] * 2), np.float32)
         for number, (exposure, frame) in enumerate(zip(exposures, frames, strict=True)):
             if strips_of[number]:
-                psfs[number] = input_psf(instrument, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
+                psfs[number] = input_psf(instrument, sampled, exposure, frame, tile.ra, tile.dec, self.settings.pixfrac)
         release_free_memory()
         sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac)
         saturated = [np.zeros(0, np.int32)]

@@ -17,15 +17,16 @@ from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of, exposures_of
 from romandask.instruments.instrument import Instrument
+from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.detectors.simple_detector import Detector, usable
 from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.model.settings import RenderSettings
-from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.image_set import ImageSet
 from romandask.products.images import Coordinates, ImageProduct
 from romandask.products.units import LazyUnits, Unit
 from romandask.stages.exposures.render import RenderExposure, cone, stage_of
 from romandask.stages.pointings import corners_of
+from romandask.stages.psf_models import Psfs, psfs_for, psfs_of
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.stages.truth.catalogs import truth_of
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
@@ -132,7 +133,7 @@ class Exposures(ImageSet):
             Each star is centred on pixel size // 2.
         """
         exposure, instrument = self.exposure(index), self.instrument
-        psf, shares = instrument.psf(exposure), flat_shares(instrument.bandpass(exposure.band))
+        psf, shares = self.renderer.psfs.model(exposure), flat_shares(instrument.bandpass(exposure.band))
         return np.stack([fine_image(psf, shares, x, y, size, 1) for x, y in positions]).astype(np.float32)
 
     def effects(self, index: int) -> dict[str, np.ndarray]:
@@ -149,12 +150,6 @@ class Exposures(ImageSet):
         return self.instrument.effects(renderer.readout, renderer.view(index), truth, renderer.left(index))
 
 
-def flat_shares(bandpass: Bandpass) -> np.ndarray:
-    """Return the fraction of the photons of a source of flat f_nu at each PSF node of a band, shape (nodes,)."""
-    photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
-    return photons / photons.sum()
-
-
 def exposures(
     table: pd.DataFrame,
     truth: TruthCatalogs,
@@ -163,6 +158,7 @@ def exposures(
     seed: int,
     calibration: ImageProduct | None = None,
     store: Store | None = None,
+    psfs: Psfs | None = None,
 ) -> Exposures:
     """Return the lazy exposures of a pointings table, with the dims (exposure, y, x).
 
@@ -182,9 +178,12 @@ def exposures(
         Calibrations of the detectors, for the full detector model; None for the simple one.
     store : Store, optional
         Store that the tables of trapped charge of earlier exposures are read from; None to compute them.
+    psfs : Psfs, optional
+        PSFs of the exposures (see `psfs_for`); None to compute them.
     """
     ny, nx = instrument.shape
     readout = instrument.readout(seed, calibration)
+    psfs = psfs_for(instrument, table, calibration) if psfs is None else psfs
     common = {
         "render": render.model_dump(),
         "seed": seed,
@@ -207,10 +206,8 @@ def exposures(
         return Unit(
             name=names[row],
             settings={**common, "row": row, **vars(exposure), "earlier": [vars(all_exposures[k]) for k in earlier]},
-            inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure)])),
+            inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure), *psfs.inputs(exposure)])),
             prerequisites=tuple(names[k] for k in earlier),
-            # exposures of the same detector and band share the PSFs in a worker's cache
-            affinity=f"{exposure.band}-{exposure.detector}",
         )
 
     axes = ("exposure",)
@@ -226,7 +223,14 @@ def exposures(
         }
 
     renderer = RenderExposure(
-        table=table, truth=truth, instrument=instrument, render=render, seed=seed, readout=readout, store=store
+        table=table,
+        truth=truth,
+        instrument=instrument,
+        render=render,
+        seed=seed,
+        readout=readout,
+        psfs=psfs,
+        store=store,
     )
     image, *others = readout.variables
     noiseless = Variable(
@@ -245,8 +249,8 @@ def exposures(
         lengths=(len(table),),
         coordinates=coordinates,
         attributes={"survey": instrument.name},
-        # image, truth, dq, background and working copies; the wide PSF of one node, while it is sampled or drawn; the
-        # objects, and the PSFs of two detectors or bands: the previous and the present ones
+        # image, truth, dq, background and working copies; the wide PSF of one node, while it is read or drawn; the
+        # objects, and the PSFs of two detectors or bands: the previous ones, and the present ones while they are read
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
         # sky, noise, detector effects and storage, then objects
         seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15),
@@ -305,6 +309,7 @@ def build_exposures(context: SurveyContext, survey: str) -> Exposures:
         pipeline.seed,
         calibration,
         context.store,
+        psfs_of(context, survey),
     )
 
 
@@ -318,7 +323,7 @@ EXPOSURES = Stage(
     per_survey=True,
     build=build_exposures,
     exists=has_exposures,
-    reads=("truth/galaxies", "truth/stars", "calibration"),
+    reads=("truth/galaxies", "truth/stars", "calibration", "psf_models"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="visit and detector",
     summary="Observed and noiseless images, rendered in Fourier space with the chromatic PSF at each position and read "

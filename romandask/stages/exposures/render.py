@@ -21,6 +21,7 @@ from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
 from romandask.products.tables import to_frame
 from romandask.stages.pointings import corners_of
+from romandask.stages.psf_models import Psfs
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.manifest import read_record
 from romandask.storage.store import Store, read_parquet
@@ -37,6 +38,7 @@ class View:
 
     exposure: Exposure
     instrument: Instrument
+    psfs: Psfs
     render: RenderSettings
     header: dict[str, Any]
     """FITS header with the WCS."""
@@ -75,7 +77,7 @@ class View:
         if self.render.engine == "galsim":
             profiles = Profiles(instrument, exposure)
             return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
-        psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
+        psf, bright = self.psfs.model(exposure), self.psfs.bright(exposure)
         return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
 
     def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
@@ -96,6 +98,8 @@ class RenderExposure:
     """Seed of the survey."""
     readout: Readout
     """The detector model."""
+    psfs: Psfs
+    """PSFs of the exposures."""
     store: Store | None = None
     """Store that the tables of earlier exposures are read from; without one they are computed."""
 
@@ -116,15 +120,16 @@ class RenderExposure:
         faintest = self.render.truncation * instrument.sky_noise(exposure, background)
         stamps = plan_stamps(
             drawable.scene,
-            instrument.psf_edges(exposure),
+            self.psfs.edges(exposure),
             instrument.shape,
             faintest,
             self.render.largest,
-            instrument.bright_psfs(exposure),
+            self.psfs.bright(exposure),
         )
         return View(
             exposure=exposure,
             instrument=instrument,
+            psfs=self.psfs,
             render=self.render,
             header=header,
             truth=truth,

@@ -32,6 +32,10 @@ class Light(Protocol):
         """Expected electrons that do not come from objects, shape (ny, nx); see `Instrument.background`."""
 
     @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the detector that are drawn; all of them for a readout that does not draw parts."""
+
+    @property
     def scene(self) -> Scene:
         """The n objects, with positions in pixels and fluxes in electrons."""
 
@@ -79,6 +83,10 @@ class Readout(Protocol):
     @property
     def tables(self) -> dict[str, pa.Schema]:
         """Schemas, by name, of the tables stored with an exposure; at most one, the result of `leave`."""
+
+    @property
+    def draws_parts(self) -> bool:
+        """True if a part of a detector can be read out without the rest: no effect spreads over the detector."""
 
     @property
     def seconds_per_pixel(self) -> float:

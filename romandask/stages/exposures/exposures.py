@@ -24,6 +24,7 @@ from romandask.model.settings import RenderSettings
 from romandask.products.image_set import ImageSet
 from romandask.products.images import Coordinates, ImageProduct
 from romandask.products.units import LazyUnits, Unit
+from romandask.stages.exposures.drawn_area import DrawnArea, drawn_area
 from romandask.stages.exposures.render import RenderExposure, cone, stage_of
 from romandask.stages.pointings import corners_of
 from romandask.stages.psf_models import Psfs, psfs_for, psfs_of
@@ -159,6 +160,7 @@ def exposures(
     calibration: ImageProduct | None = None,
     store: Store | None = None,
     psfs: Psfs | None = None,
+    area: DrawnArea | None = None,
 ) -> Exposures:
     """Return the lazy exposures of a pointings table, with the dims (exposure, y, x).
 
@@ -180,6 +182,9 @@ def exposures(
         Store that the tables of trapped charge of earlier exposures are read from; None to compute them.
     psfs : Psfs, optional
         PSFs of the exposures (see `psfs_for`); None to compute them.
+    area : DrawnArea, optional
+        Tiles for which parts of detectors are drawn; None to draw whole detectors, as for a detector model that cannot
+        draw a part.
     """
     ny, nx = instrument.shape
     readout = instrument.readout(seed, calibration)
@@ -193,6 +198,7 @@ def exposures(
         "psf": instrument.psf_settings,
         "readout": readout.settings,
     }
+    area = area if readout.draws_parts else None
     all_exposures = exposures_of(table)
     names = [exposure.name for exposure in all_exposures]
     corners = corners_of(table)
@@ -205,7 +211,13 @@ def exposures(
         exposure = all_exposures[row]
         return Unit(
             name=names[row],
-            settings={**common, "row": row, **vars(exposure), "earlier": [vars(all_exposures[k]) for k in earlier]},
+            settings={
+                **common,
+                "row": row,
+                **vars(exposure),
+                "earlier": [vars(all_exposures[k]) for k in earlier],
+                "tiles": None if area is None else [tile.name for tile in area.tiles.get(row, ())],
+            },
             inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure), *psfs.inputs(exposure)])),
             prerequisites=tuple(names[k] for k in earlier),
         )
@@ -230,6 +242,7 @@ def exposures(
         seed=seed,
         readout=readout,
         psfs=psfs,
+        area=area,
         store=store,
     )
     image, *others = readout.variables
@@ -238,7 +251,7 @@ def exposures(
         dtype="float32",
         shape=instrument.shape,
         axes=("y", "x"),
-        attributes={"units": "electron", "long_name": "noiseless image of the objects"},
+        attributes={**image.attributes, "long_name": "noiseless image of the objects"},
     )
     product = ImageProduct(
         stage=stage_of(instrument),
@@ -248,12 +261,14 @@ def exposures(
         axes=axes,
         lengths=(len(table),),
         coordinates=coordinates,
-        attributes={"survey": instrument.name},
+        attributes={"survey": instrument.name, "area": "detector" if area is None else "region"},
         # image, truth, dq, background and working copies; the wide PSF of one node, while it is read or drawn; the
         # objects, and the PSFs of two detectors or bands: the previous ones, and the present ones while they are read
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
-        # sky, noise, detector effects and storage, then objects
-        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15),
+        # sky, noise, detector effects and storage, then objects; what is not drawn is still stored, as one value
+        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15)
+        if area is None
+        else ny * nx * (5e-8 + area.share(instrument.shape, instrument.pixel_scale) * readout.seconds_per_pixel),
         tables=readout.tables,
     )
     return Exposures(product=product, renderer=renderer)
@@ -310,7 +325,15 @@ def build_exposures(context: SurveyContext, survey: str) -> Exposures:
         calibration,
         context.store,
         psfs_of(context, survey),
+        _area(context, survey) if pipeline.exposures.area == "region" else None,
     )
+
+
+def _area(context: SurveyContext, survey: str) -> DrawnArea:
+    """Return the area of the exposures of an instrument that the tiles of the survey need."""
+    settings, scale = context.pipeline.coadds, context.instruments[survey].coadd_scale
+    grid = settings.grid()
+    return drawn_area(context.pointings(survey), context.tiles, grid.side, grid.pixels(scale), scale)
 
 
 def has_exposures(context: SurveyContext, survey: str) -> bool:

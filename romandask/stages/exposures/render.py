@@ -13,6 +13,7 @@ from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument, Readout
+from romandask.kernels.detectors.simple_detector import WHOLE
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
@@ -20,6 +21,7 @@ from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
 from romandask.products.tables import to_frame
+from romandask.stages.exposures.drawn_area import DrawnArea, Window
 from romandask.stages.pointings import corners_of
 from romandask.stages.psf_models import Psfs
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
@@ -48,6 +50,8 @@ class View:
     """The objects that can be drawn."""
     background: np.ndarray
     """Expected electrons that do not come from objects, shape (ny, nx)."""
+    window: Window
+    """Rows and columns that are drawn."""
     faintest: float
     """Largest surface brightness at the edge of a stamp, electrons/pixel."""
     stamps: Stamps
@@ -100,6 +104,8 @@ class RenderExposure:
     """The detector model."""
     psfs: Psfs
     """PSFs of the exposures."""
+    area: DrawnArea | None = None
+    """Tiles for which parts of detectors are drawn; None to draw whole detectors."""
     store: Store | None = None
     """Store that the tables of earlier exposures are read from; without one they are computed."""
 
@@ -108,9 +114,11 @@ class RenderExposure:
         exposure, instrument = exposure_of(self.table.iloc[index]), self.instrument
         header = instrument.header(exposure)
         truth = self.truth.near(*cone(corners_of(self.table.iloc[[index]])[0]))
+        frame = WCS(header)
+        window = WHOLE if self.area is None else self.area.window(index, frame, instrument.shape)
         drawable = build_scene(
             truth,
-            WCS(header),
+            frame,
             instrument.bandpass(exposure.band),
             exposure.exptime,
             instrument.knot_smoothing,
@@ -135,8 +143,9 @@ class RenderExposure:
             truth=truth,
             drawable=drawable,
             background=background,
+            window=window,
             faintest=faintest,
-            stamps=stamps,
+            stamps=replace(stamps, size=np.where(_on_window(drawable.scene, stamps, window), stamps.size, 0)),
         )
 
     def __call__(self, index: int) -> dict[str, Any]:
@@ -155,6 +164,16 @@ class RenderExposure:
             (table_name,) = self.readout.tables
             return to_frame(read_parquet(table_beside(self.store, stage, table_name, exposure.name)))
         return self.readout.leave(self.view(index))
+
+
+def _on_window(scene: Scene, stamps: Stamps, window: Window) -> np.ndarray:
+    """Return True for the objects, shape (n,), whose stamps overlap the part of the detector that is drawn."""
+    overlaps = np.ones(len(scene.x), bool)
+    for part, position in zip(window, (scene.y, scene.x), strict=True):
+        if part != slice(None):
+            half = stamps.size // 2 + 1
+            overlaps &= (position > part.start - half) & (position < part.stop - 1 + half)
+    return overlaps
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,10 @@ class Light(Protocol):
 
     @property
     def background(self) -> np.ndarray:
-        """Expected electrons that do not come from objects, shape (ny, nx); see `Instrument.background`."""
+        """Expected electrons that do not come from objects, shape (ny, nx); see `Instrument.background`.
+
+        They are 0 outside `window`.
+        """
 
     @property
     def window(self) -> tuple[slice, slice]:

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.readout import Light
-from romandask.kernels.detectors.simple_detector import NOT_DRAWN, NOT_DRAWN_VALUE, SIMPLE_FLAGS, Detector, observe
+from romandask.kernels.detectors.simple_detector import NOT_DRAWN_VALUE, SIMPLE_FLAGS, WHOLE, Detector, observe
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
@@ -74,6 +74,8 @@ class SimpleReadout:
         exposure, expected = light.exposure, light.expected()
         generator = partial(rng, self.seed, "exposures", self.name, exposure.visit, exposure.detector)
         image, dq = observe(expected, light.background, self.detector, generator, light.window)
-        if (dq & NOT_DRAWN).any():
-            expected = np.where(dq & NOT_DRAWN, np.float32(NOT_DRAWN_VALUE), expected)
+        if light.window != WHOLE:
+            drawn = expected[light.window]
+            expected = np.full(expected.shape, NOT_DRAWN_VALUE, np.float32)
+            expected[light.window] = drawn
         return {"image": image, "truth": expected, "dq": dq}

@@ -63,8 +63,8 @@ def index_of(view: View, ab_photons: float) -> pd.DataFrame:
     drawable, truth = view.drawable, view.truth
     n = len(drawable.reasons)
     reasons, flux, stamp = drawable.reasons.copy(), np.zeros(n), np.zeros(n, np.int32)
-    stamp[drawable.rows] = view.stamps.size
-    reasons[drawable.rows[view.stamps.size == 0]] = OFF_IMAGE
+    stamp[drawable.rows] = np.where(view.shown, view.stamps.size, 0)
+    reasons[drawable.rows[~view.shown]] = OFF_IMAGE
     drawn = stamp > 0
     total = np.zeros(n)
     total[drawable.rows] = drawable.scene.fluxes()

@@ -32,6 +32,8 @@ REACH = 30.0
 """Distance from a detector within which galaxies are taken into account, arcsec."""
 STAR_REACH = 115.0
 """As REACH, for stars; it is larger because the diffraction spikes of bright stars are long."""
+_SKY_SAMPLE = slice(None, None, 32)
+"""Rows, and columns, of a detector from which the mean sky is taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +51,7 @@ class View:
     drawable: Drawable
     """The objects that can be drawn."""
     background: np.ndarray
-    """Expected electrons that do not come from objects, shape (ny, nx)."""
+    """Expected electrons that do not come from objects, shape (ny, nx); 0 outside `window`."""
     window: Window
     """Rows and columns that are drawn."""
     faintest: float
@@ -66,6 +68,15 @@ class View:
     def stamp_sizes(self) -> np.ndarray:
         """Side of the stamp of each object, shape (n,), pixels; 0 for an object that is not drawn."""
         return self.stamps.size
+
+    @property
+    def shown(self) -> np.ndarray:
+        """True for the objects, shape (n,), whose stamps overlap the part of the detector that is drawn."""
+        shown, half = self.stamps.size > 0, self.stamps.size // 2
+        for part, side, position in zip(self.window, self.background.shape, (self.scene.y, self.scene.x), strict=True):
+            start, stop, _ = part.indices(side)
+            shown &= (position > start - half) & (position < stop - 1 + half)
+        return shown
 
     def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
         """Return the noiseless image of the objects, shape (ny, nx), electrons.
@@ -124,8 +135,11 @@ class RenderExposure:
             instrument.knot_smoothing,
             (instrument.shape, STAR_REACH / instrument.pixel_scale),
         )
-        background = instrument.background(exposure, header)
-        faintest = self.render.truncation * instrument.sky_noise(exposure, background)
+        background = np.zeros(instrument.shape, np.float32)
+        background[window] = instrument.background(exposure, header, *window)
+        # the mean sky of the whole detector, whatever part is drawn
+        sky = instrument.background(exposure, header, _SKY_SAMPLE, _SKY_SAMPLE)
+        faintest = self.render.truncation * instrument.sky_noise(exposure, sky)
         stamps = plan_stamps(
             drawable.scene,
             self.psfs.edges(exposure),
@@ -145,7 +159,7 @@ class RenderExposure:
             background=background,
             window=window,
             faintest=faintest,
-            stamps=replace(stamps, size=np.where(_on_window(drawable.scene, stamps, window), stamps.size, 0)),
+            stamps=stamps,
         )
 
     def __call__(self, index: int) -> dict[str, Any]:
@@ -164,16 +178,6 @@ class RenderExposure:
             (table_name,) = self.readout.tables
             return to_frame(read_parquet(table_beside(self.store, stage, table_name, exposure.name)))
         return self.readout.leave(self.view(index))
-
-
-def _on_window(scene: Scene, stamps: Stamps, window: Window) -> np.ndarray:
-    """Return True for the objects, shape (n,), whose stamps overlap the part of the detector that is drawn."""
-    overlaps = np.ones(len(scene.x), bool)
-    for part, position in zip(window, (scene.y, scene.x), strict=True):
-        if part != slice(None):
-            half = stamps.size // 2 + 1
-            overlaps &= (position > part.start - half) & (position < part.stop - 1 + half)
-    return overlaps
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,10 @@ from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.arrays import Variable
 from romandask.storage.store import Store
 
+_FIRST_USES = 2
+"""Exposures of a detector and band from which the PSF of the fainter bright stars is stored: making it takes as long as
+to store it and read it twice. The PSFs of brighter stars, which fewer exposures show, are stored from four times as
+many, each time."""
 _AXES = {
     "layout": ("number",),
     "nodes": ("node", "row", "column"),
@@ -98,6 +102,8 @@ class SharedPsfs:
 
     instrument: Instrument
     layout: PsfLayout
+    stored_bright: tuple[int, ...]
+    """Number of PSFs of bright stars in each unit; the others are made when they are needed."""
     product: ImageProduct
     """PSF models, one unit per detector and band."""
 
@@ -118,12 +124,14 @@ class SharedPsfs:
         return _edges(self._unit(exposure))
 
     def bright(self, exposure: Exposure) -> tuple[BrightPsf, ...]:
-        """Return the PSFs of bright stars, whose transforms are read one at a time."""
-        unit = self._unit(exposure)
-        return tuple(
+        """Return the PSFs of bright stars, whose transforms are read, or made, one at a time."""
+        unit, found = self._unit(exposure), self.instrument.bright_psfs(exposure)
+        stored = self.stored_bright[unit.index]
+        read = tuple(
             replace(psf, nodes=_Transforms(unit=unit, number=number, length=len(psf.nodes), shape=psf.grid.shape))
-            for number, psf in enumerate(self.instrument.bright_psfs(exposure))
+            for number, psf in enumerate(found[:stored])
         )
+        return read + found[stored:]
 
     def centre(self, exposure: Exposure) -> np.ndarray:
         """Return the oversampled image of a star at the centre of the detector."""
@@ -200,6 +208,8 @@ class MakePsfModel:
     layout: PsfLayout
     exposures: tuple[Exposure, ...]
     """An exposure of each detector and band; all others have the same PSF."""
+    stored_bright: tuple[int, ...]
+    """Number of PSFs of bright stars in each unit; the arrays of the others are 0."""
 
     def __call__(self, index: int) -> dict[str, Any]:
         """Return functions that return the arrays of a unit, by name; see `arrays_of`."""
@@ -211,7 +221,9 @@ class MakePsfModel:
             "centre": partial(centre_image, instrument, exposure),
             **{
                 _bright_name(number, node): partial(_bright_transform, instrument, exposure, number, node, grid.shape)
-                for number, (nodes, grid) in enumerate(self.layout.bright)
+                if number < self.stored_bright[index]
+                else partial(np.zeros, grid.shape, np.complex64)
+                for number, (nodes, grid) in enumerate(self.layout.bright[: max(self.stored_bright)])
                 for node in range(nodes)
             },
         }
@@ -273,19 +285,22 @@ def psf_models(
     """
     pairs = table.drop_duplicates(["detector", "band"]).sort_values(["band", "detector"])
     exposures = tuple(exposures_of(pairs))
+    uses = table.groupby(["band", "detector"]).size().sort_index()
+    stored_bright = tuple(sum(count >= _FIRST_USES * 4**k for k in range(len(layout.bright))) for count in uses)
+    stored = replace(layout, bright=layout.bright[: max(stored_bright)])
     readout = instrument.readout(0, calibration)
     shared = {
         "instrument": instrument.name,
         "psf": instrument.psf_settings,
-        "layout": [*layout.shapes.items(), *((nodes, grid.shape) for nodes, grid in layout.bright)],
+        "layout": [*stored.shapes.items(), *((nodes, grid.shape) for nodes, grid in stored.bright)],
     }
     units = tuple(
         Unit(
             name=_name(exposure),
-            settings={**shared, "band": exposure.band, "detector": exposure.detector},
+            settings={**shared, "band": exposure.band, "detector": exposure.detector, "bright": bright},
             inputs=readout.inputs(exposure),
         )
-        for exposure in exposures
+        for exposure, bright in zip(exposures, stored_bright, strict=True)
     )
     axis = ("model",)
 
@@ -296,22 +311,22 @@ def psf_models(
             "detector": (axis, pairs["detector"].to_numpy(), {}),
         }
 
-    bright_values = sum(nodes * int(np.prod(grid.shape)) for nodes, grid in layout.bright)
-    largest = max([int(np.prod(grid.shape)) for _, grid in layout.bright], default=0)
+    bright_values = sum(nodes * int(np.prod(grid.shape)) for nodes, grid in stored.bright)
+    largest = max([int(np.prod(grid.shape)) for _, grid in stored.bright], default=0)
     sampled = sum(int(np.prod(layout.shapes[name])) for name in ("nodes", "modes"))
     product = ImageProduct(
         stage=f"psf_models/{instrument.name}",
         units=units,
-        make=MakePsfModel(instrument, layout, exposures),
-        variables=_variables(layout),
+        make=MakePsfModel(instrument, layout, exposures, stored_bright),
+        variables=_variables(stored),
         axes=axis,
         lengths=(len(units),),
         coordinates=coordinates,
         attributes={"survey": instrument.name, "pixel_scale": instrument.pixel_scale},
-        bytes_per_unit=max(sampled * 40, largest * 85) + (200 << 20),
+        bytes_per_unit=max(sampled * 32, largest * 70) + (100 << 20),
         seconds_per_unit=sampled * 1.5e-7 + bright_values * 2e-7,
     )
-    return SharedPsfs(instrument=instrument, layout=layout, product=product)
+    return SharedPsfs(instrument=instrument, layout=layout, stored_bright=stored_bright, product=product)
 
 
 def _variables(layout: PsfLayout) -> tuple[Variable, ...]:
@@ -337,7 +352,7 @@ def _variables(layout: PsfLayout) -> tuple[Variable, ...]:
                 _bright_name(number, node),
                 grid.shape,
                 (f"bright_{number}_row", f"bright_{number}_column"),
-                "transform of the PSF of bright stars in the middle of the detector",
+                "transform of the PSF of bright stars in the middle of the detector; 0 if it is not stored",
                 "complex64",
             )
             for number, (nodes, grid) in enumerate(layout.bright)

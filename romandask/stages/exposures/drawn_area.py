@@ -31,6 +31,10 @@ class DrawnArea:
     scale: float
     """Size of a tile pixel, arcsec."""
 
+    def settings(self, row: int) -> dict[str, object]:
+        """Return what the drawn part of an exposure depends on, as JSON values."""
+        return {"tiles": [tile.name for tile in self.tiles.get(row, ())], "pixels": self.pixels, "scale": self.scale}
+
     def window(self, row: int, frame: WCS, shape: tuple[int, int]) -> Window:
         """Return the part of a detector that is drawn.
 

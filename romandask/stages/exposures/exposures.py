@@ -216,7 +216,7 @@ def exposures(
                 "row": row,
                 **vars(exposure),
                 "earlier": [vars(all_exposures[k]) for k in earlier],
-                "tiles": None if area is None else [tile.name for tile in area.tiles.get(row, ())],
+                "area": None if area is None else area.settings(row),
             },
             inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure), *psfs.inputs(exposure)])),
             prerequisites=tuple(names[k] for k in earlier),

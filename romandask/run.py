@@ -334,13 +334,13 @@ def _running(
 ) -> Iterator[Run]:
     """Lock the store, write the settings and package versions, and log the start and the end of the run."""
     store = store_of(survey)
-    with locked(store.root):
+    with locked(store.root, reporter.say) as lock:
         versions = {name: version(name) for name in PACKAGES}
         write_bytes(store.pipeline, survey.pipeline.to_yaml().encode())
         write_json(store.root / "versions.json", versions)
         write_checksums(store, "store", [store.pipeline, store.root / "versions.json"])
         ignore_stale_unit_lists(survey, products)
-        current_run = Run(store, runner, reporter, Log(store.log), retry)
+        current_run = Run(store, runner, reporter, Log(store.log, lock.check), retry)
         current_run.log.write("run", pipeline=survey.pipeline.name, on=runner.description, versions=versions)
         end = "stopped"
         try:

@@ -25,11 +25,12 @@ from romandask.stages.analysis.differences import science_survey
 from romandask.stages.analysis.friends_of_friends import cut_groups, matches_of
 from romandask.stages.analysis.validation import depths, residuals, with_truth
 from romandask.stages.coadds.psf_at import Spectrum, coadd_psf
-from romandask.stages.cutouts import Positions, Wanted, cutouts, located
+from romandask.stages.cutouts import cutouts
 from romandask.stages.detections.truth_match import completeness
 from romandask.stages.detections.zero_points import FLUXES
 from romandask.stages.pointings import visits
 from romandask.stages.truth.catalogs import TruthCatalogs, truth_of
+from romandask.stages.wanted import Positions, Wanted, located
 from romandask.storage.paths import AnyPath, access_errors_explained, parse_path
 from romandask.storage.store import Store
 from romandask.survey_graph import unit_graph

@@ -107,7 +107,10 @@ def test_nothing_that_a_user_writes_can_become_code():
 @pytest.mark.slow
 def test_linear_algebra_has_one_thread_wherever_the_package_is():
     """Its sums are rounded otherwise with more, and so are pixels: not by an environment that is set too late alone."""
-    code = "import numpy; import romandask, threadpoolctl, json; print(json.dumps(threadpoolctl.threadpool_info()))"
+    code = (
+        "import romandask, threadpoolctl, json; romandask.Survey; import scipy.linalg, numpy\n"
+        "print(json.dumps(threadpoolctl.threadpool_info()))"
+    )
     environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     pools = [pool for pool in json.loads(done.stdout) if pool["user_api"] == "blas"]

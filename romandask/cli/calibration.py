@@ -11,8 +11,6 @@ from rich.console import Console
 from romandask.engine.progress import busy
 from romandask.export.command import report_written
 from romandask.export.options import Folder
-from romandask.instruments.roman.calibration import check_files, make_files
-from romandask.instruments.roman.focal_plane import SCAS
 
 calibration_app = typer.Typer(no_args_is_help=True)
 
@@ -30,6 +28,9 @@ def make(
     sca: Annotated[list[int] | None, typer.Option("--sca", help="SCA, 1-18; may be repeated; default: all.")] = None,
 ) -> None:
     """Make calibration files of made-up detectors, with the statistics of the real ones: 1.6 GB an SCA."""
+    from romandask.instruments.roman.calibration import make_files
+    from romandask.instruments.roman.focal_plane import SCAS
+
     report_written(make_files(out, seed, sca or SCAS))
 
 
@@ -38,5 +39,7 @@ def check(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of sca01.fits to sca18.fits.")],
 ) -> None:
     """Check that calibration files have every extension of table 1 of Troxel et al. (2023), with its type and shape."""
+    from romandask.instruments.roman.calibration import check_files
+
     for path in check_files(folder):
         Console().print(f"{path}: as it should be", highlight=False, soft_wrap=True)

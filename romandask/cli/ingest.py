@@ -7,16 +7,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from romandask import run as running
-from romandask.cli.options import Order, Spectra, StoreOption, Workers, resumable, source_path
-from romandask.engine.clients import runner
+from romandask.cli.interrupts import resumable
+from romandask.cli.options import Order, Spectra, StoreOption, Workers, source_path
 from romandask.engine.progress import Reporter
 from romandask.model.errors import UserError
-from romandask.model.settings import read_yaml
-from romandask.pipeline import instrument_types, pipeline_of
 from romandask.storage.paths import AnyPath, resolve_below
-from romandask.storage.store import Store
-from romandask.survey import Survey
 
 ingest_app = typer.Typer(no_args_is_help=True, help="Convert a real catalog into the truth catalogs of a store.")
 
@@ -68,6 +63,8 @@ def table(
     workers: Workers = 0,
 ) -> None:
     """Convert Parquet or FITS tables, with a map of their columns."""
+    from romandask.model.settings import read_yaml
+
     sections = read_yaml(columns)
     unknown = sorted(set(sections) - {"galaxies", "stars"})
     if unknown or not sections:
@@ -83,9 +80,16 @@ def table(
     _ingest(columns, content, store, seds, order, workers)
 
 
+@resumable()
 def _ingest(
     source: AnyPath, truth: dict[str, Any], store: AnyPath, seds: AnyPath | None, order: int, workers: int | None
 ) -> None:
+    from romandask import run as running
+    from romandask.engine.clients import runner
+    from romandask.pipeline import instrument_types, pipeline_of
+    from romandask.storage.store import Store
+    from romandask.survey import Survey
+
     content = {
         "name": "ingest",
         "seed": 0,
@@ -99,6 +103,6 @@ def _ingest(
     survey.output("truth/ingested")
     Store(store).prepare()
     reporter = Reporter(Console())
-    with resumable(), runner(workers or 0, settings.run.memory_limit) as execution:
+    with runner(workers or 0, settings.run.memory_limit) as execution:
         counts = running.ingest(survey, execution, reporter)
     reporter.say(f"rows in {counts['in']} = rows out {counts['out']} + quarantined {counts['quarantined']}")

@@ -1,4 +1,7 @@
-"""Main commands of the command line. A mistake of the user ends with one line on standard error and exit code 2."""
+"""Main commands of the command line. A mistake of the user ends with one line on standard error and exit code 2.
+
+Commands import what they need when they run, so that help, version and completion are there at once.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 # one thread per process, because the workers are the parallelism; set before the libraries are imported
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -16,30 +19,24 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 import typer  # noqa: E402
 from rich.console import Console  # noqa: E402
-from rich.live import Live  # noqa: E402
-from rich.table import Table  # noqa: E402
 
 from romandask import __version__  # noqa: E402
-from romandask import run as running  # noqa: E402
 from romandask.cli.calibration import calibration_app  # noqa: E402
 from romandask.cli.export import export_app  # noqa: E402
 from romandask.cli.ingest import ingest_app  # noqa: E402
-from romandask.cli.options import Scheduler, StoreOption, Workers, resumable  # noqa: E402
-from romandask.cli.plan_table import print_plan  # noqa: E402
-from romandask.engine.clients import runner  # noqa: E402
+from romandask.cli.interrupts import resumable  # noqa: E402
+from romandask.cli.options import Scheduler, StoreOption, Workers  # noqa: E402
 from romandask.engine.progress import Reporter, busy, duration  # noqa: E402
 from romandask.export import sha256sums  # noqa: E402
 from romandask.export.options import Overrides, Source, StoreArgument  # noqa: E402
 from romandask.model.errors import UserError  # noqa: E402
-from romandask.pipeline import load_pipeline  # noqa: E402
-from romandask.report.page import write_report  # noqa: E402
-from romandask.report.reference import reference as data_product_reference  # noqa: E402
-from romandask.report.stage_diagram import write_stage_diagram  # noqa: E402
-from romandask.stage_graph import Selection, stage_products  # noqa: E402
-from romandask.stages.coadds.pixfrac import advice, coverage  # noqa: E402
 from romandask.storage.lock import in_use  # noqa: E402
-from romandask.storage.store import FULL, Store  # noqa: E402
-from romandask.survey import Survey, open_survey  # noqa: E402
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from romandask.stage_graph import Selection
+    from romandask.survey import Survey
 
 app = typer.Typer(
     add_completion=True,
@@ -75,6 +72,12 @@ def plan(
     dag: Annotated[Path | None, typer.Option("--dag", help="Write a diagram of the stages to this SVG file.")] = None,
 ) -> None:
     """Show the units, image bytes, core hours and worker memory of every stage, without making anything."""
+    from romandask import run as running
+    from romandask.cli.plan_table import print_plan
+    from romandask.pipeline import load_pipeline
+    from romandask.report.stage_diagram import write_stage_diagram
+    from romandask.survey import Survey
+
     settings = load_pipeline(pipeline, overrides)
     with busy("planning"):
         survey = Survey(settings)
@@ -89,6 +92,12 @@ def plan(
 @app.command()
 def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
     """Compare values of coadds.pixfrac on the Roman dithers and recommend one, without making anything."""
+    from rich.table import Table
+
+    from romandask.pipeline import load_pipeline
+    from romandask.stages.coadds.pixfrac import advice, coverage
+    from romandask.survey import Survey
+
     with busy("drizzling weights"):
         survey = Survey(load_pipeline(pipeline, overrides))
         rows = coverage(survey.output(f"coadds/{survey.sharpest}"))
@@ -103,6 +112,7 @@ def pixfrac(pipeline: Source, overrides: Overrides = None) -> None:
 
 
 @app.command()
+@resumable()
 def run(
     pipeline: Source,
     store: StoreOption,
@@ -127,6 +137,14 @@ def run(
     ] = False,
 ) -> None:
     """Make and store all missing and outdated units, then write the report. The same command resumes a run."""
+    from romandask import run as running
+    from romandask.engine.clients import runner
+    from romandask.pipeline import load_pipeline
+    from romandask.report.page import write_report
+    from romandask.stage_graph import Selection, stage_products
+    from romandask.storage.store import Store
+    from romandask.survey import Survey, open_survey
+
     survey = Survey(load_pipeline(pipeline, overrides), Store(store))
     settings, reporter = survey.pipeline, Reporter(Console())
     selection = Selection(tuple(only or ()), start)
@@ -140,7 +158,7 @@ def run(
         return
     start_time = time.monotonic()
     count = settings.run.workers if workers is None else workers
-    with resumable(), runner(count, settings.run.memory_limit, scheduler) as execution:
+    with runner(count, settings.run.memory_limit, scheduler) as execution:
         Store(store).prepare()
         hours = sum(row.hours for row in planned)
         reporter.say(f"{settings.name}: {execution.description}")
@@ -170,6 +188,8 @@ def run(
 
 
 def _explain(survey: Survey, selection: Selection, retry: bool, reporter: Reporter) -> None:
+    from romandask import run as running
+
     for row in running.explain(survey, selection, retry):
         if row.made or row.reasons:
             reasons = ", ".join(f"{count} {reason}" for reason, count in row.reasons.items())
@@ -183,6 +203,10 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Update the table until the run in progress ends.")] = False,
 ) -> None:
     """Show the units done, missing and failed of each stage, and the last event of the newest run."""
+    from rich.live import Live
+
+    from romandask.survey import open_survey
+
     with busy("looking at the store"):
         survey = open_survey(store)
         table = _status(survey)
@@ -196,6 +220,10 @@ def status(
 
 
 def _status(survey: Survey) -> Table:
+    from rich.table import Table
+
+    from romandask import run as running
+
     table = Table(
         "stage", "units", "done", "missing", "failed", caption=running.last_event(survey), caption_justify="left"
     )
@@ -224,6 +252,9 @@ def verify(
             raise UserError(f"{store}: exported files have no stages and no records: verify them without options")
         _verify_files(store)
         return
+    from romandask import run as running
+    from romandask.survey import open_survey
+
     units = damaged = 0
     with busy("reading every byte"):
         survey = open_survey(store)
@@ -256,6 +287,9 @@ def _verify_files(folder: Path) -> None:
 @app.command()
 def report(store: StoreArgument) -> None:
     """Write the report of a store, one HTML page without external assets."""
+    from romandask.report.page import write_report
+    from romandask.survey import open_survey
+
     with busy("writing the report"):
         path = write_report(open_survey(store))
     Console().print(f"report: {path}", highlight=False, soft_wrap=True)
@@ -264,6 +298,8 @@ def report(store: StoreArgument) -> None:
 @app.command()
 def reference() -> None:
     """Print the reference of all tables and images (Markdown), with columns, units and axes."""
+    from romandask.report.reference import reference as data_product_reference
+
     print(data_product_reference(), end="")
 
 
@@ -276,6 +312,8 @@ def main() -> None:
     try:
         app()
     except OSError as error:
+        from romandask.storage.store import FULL
+
         # any write can meet a full or read-only disk
         if error.errno not in FULL:
             raise

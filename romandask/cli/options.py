@@ -1,13 +1,10 @@
-"""Options that several commands share, and the handling of interrupts.
+"""Options that several commands share.
 
 Arguments that commands of `romandask export` have too are in `romandask.export.options`.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
@@ -41,19 +38,3 @@ Spectra = Annotated[
     ),
 ]
 Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions of the catalogs.")]
-
-
-@contextmanager
-def resumable(text: str = "stopped; the same command resumes") -> Iterator[None]:
-    """Turn Ctrl-C into one line on standard error and exit code 130.
-
-    Parameters
-    ----------
-    text : str
-        The line. Stored units stay, so the same command resumes.
-    """
-    try:
-        yield
-    except KeyboardInterrupt:
-        print(text, file=sys.stderr)
-        raise typer.Exit(130) from None

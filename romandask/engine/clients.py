@@ -9,18 +9,27 @@ import gc
 import re
 import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import dask
 import yaml
 from distributed import Client, LocalCluster, Nanny, performance_report
+from distributed.utils import LoopRunner
 
 from romandask.engine.lost_units import EXIT_TOPIC
 from romandask.engine.runners import InProcess, OnCluster, Runner
+from romandask.engine.worker_start import (
+    main_guard_demanded,
+    script_ran_again,
+    sigint_blocked,
+    start_resource_tracker,
+)
 from romandask.model.errors import UserError
 from romandask.model.resources import resource_folder
 from romandask.storage.paths import AnyPath, write_bytes
@@ -79,7 +88,9 @@ def runner(workers: int, memory_limit: float, scheduler: str | None = None) -> I
     settings = yaml.safe_load((resource_folder("pipelines") / "cluster" / "workers.yaml").read_text())
     with (
         dask.config.set(dask.config.merge({"distributed": dask.config.get("distributed")}, settings)),
-        _local_cluster(workers, int(memory_limit * 2**30)) as cluster,
+        main_guard_demanded(),
+        _event_loop() as loop,
+        _local_cluster(workers, int(memory_limit * 2**30), loop) as cluster,
         Client(cluster) as client,
     ):
         # dask does not restart a worker that dies during its start; scaling to the wanted number does
@@ -130,12 +141,25 @@ class ReportingNanny(Nanny):
         super()._on_worker_exit_sync(exitcode)
 
 
-def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
+@contextmanager
+def _event_loop() -> Iterator[Any]:
+    """Run an event loop in a thread that does not receive SIGINT; the processes that it starts do not either."""
+    start_resource_tracker()
+    loop_runner = LoopRunner()
+    with sigint_blocked():
+        loop_runner.start()
+    try:
+        yield loop_runner.loop
+    finally:
+        loop_runner.stop()
+
+
+def _local_cluster(workers: int, memory_limit: int, loop: Any) -> LocalCluster:
     """Start one-thread worker processes on the loopback interface; start again if one dies during its start."""
     reason = ""
     for _ in range(START_ATTEMPTS):
         try:
-            return LocalCluster(
+            return _started(
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
@@ -144,12 +168,27 @@ def _local_cluster(workers: int, memory_limit: int) -> LocalCluster:
                 dashboard_address=f"127.0.0.1:{_free_port(8787)}",
                 memory_limit=memory_limit,
                 silence_logs=50,
+                loop=loop,
             )
         except RuntimeError as error:
             reason = str(error.__cause__ or error)
+            if script_ran_again():
+                break
     raise UserError(
         f"{workers} local workers cannot be started ({reason}): free memory or processes, or run with --workers 0"
     )
+
+
+def _started(**options: Any) -> LocalCluster:
+    """Return a started cluster. It is started in a thread: an interrupt closes it when it has started, not half-way."""
+    with ThreadPoolExecutor(1) as executor:
+        starting = executor.submit(LocalCluster, **options)
+        try:
+            return starting.result()
+        except KeyboardInterrupt:
+            with suppress(RuntimeError):
+                starting.result().close()
+            raise
 
 
 def _check_workers(client: Client, cluster_name: str, memory_limit: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,12 @@ class Log:
     ----------
     folder : path
         Folder of the logs of a store. A local folder is created.
+    check : callable
+        Called before each event is written. Raises an error if the run must stop.
     """
 
-    def __init__(self, folder: AnyPath):
+    def __init__(self, folder: AnyPath, check: Callable[[], None] = lambda: None):
+        self._check = check
         self.name = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"
         self._folder = folder
         self._lines: list[str] = []
@@ -43,6 +46,7 @@ class Log:
 
     def write(self, event: str, **values: Any) -> None:
         """Write one event with the current time (UTC, ISO 8601)."""
+        self._check()
         line = json.dumps({"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **values})
         if isinstance(self._folder, Path):
             with open(self._folder / f"{self.name}{LOG_SUFFIX}", "a", encoding="utf-8") as file:

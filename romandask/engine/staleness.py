@@ -197,6 +197,13 @@ def remove_stray_records(product: Product, store: Store, made: Set[str]) -> None
             remove(_failure(store, product.stage, name))
 
 
+def remove_failures(store: Store) -> None:
+    """Remove the failures of the units of all stages, so that the next run makes these units again."""
+    for stage in store.stages():
+        for name in failed(store, stage):
+            remove(_failure(store, stage, name))
+
+
 def failed(store: Store, stage: str) -> list[str]:
     """Return the names of the units of a stage that failed."""
     return file_names(store.records(stage), FAILURE_SUFFIX)

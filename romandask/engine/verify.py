@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from romandask.engine.run_stages import RunnableStage
+from romandask.engine.staleness import remove_failures
 from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct
 from romandask.storage.checksums import damaged_files, remove_checksums
@@ -15,6 +16,8 @@ from romandask.storage.store import Store
 
 OTHER_FILES = ("truth/seds", "store")
 """Names of the checksums of files that belong to no unit: the spectral library, and settings with versions."""
+ALL_UNITS = "*"
+"""Stands for the units of a stage whose names cannot be known."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,15 @@ def verify(stages: list[RunnableStage], store: Store, only: str | None = None) -
         records = dict(read_records(store, stage.name))
         if not records:
             continue
-        product, damaged = stage.product(), []
+        damaged: list[tuple[str, str]] = []
+        try:
+            product = stage.product()
+        except Exception as error:
+            # its units follow from products that are damaged too, which were verified before
+            sources = ", ".join(sorted(stage.known_after))
+            reason = f"cannot be verified before {sources} is made again ({type(error).__name__})"
+            yield Verified(stage.name, len(records), ((ALL_UNITS, reason),))
+            continue
         numbers = {name: index for index, name in enumerate(product.names)}
         for name, record in records.items():
             damage = _damage(product, store, numbers, name, record)
@@ -63,11 +74,14 @@ def forget(store: Store, verified: Verified) -> None:
     """Remove the records of the damaged units of a stage, so that the next run makes these units again.
 
     If metadata of an image product is damaged, the content of its arrays is uncertain: the arrays and the records of
-    all units are removed.
+    all units are removed. Failures of units are removed too: units that have read damaged data failed, and would be
+    skipped, because that data will be the same as before when it is made again.
     """
+    if verified.damaged:
+        remove_failures(store)
     metadata = {name for name, _ in damaged_files(store, verified.stage)}
     for name, _ in verified.damaged:
-        if name not in metadata:
+        if name not in metadata and name != ALL_UNITS:
             remove(store.record(verified.stage, name))
     if not metadata:
         return

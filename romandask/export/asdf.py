@@ -10,13 +10,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from romandask.export.asdf_writer import MosaicMetadata, check_packages, write_exposure, write_mosaic
 from romandask.export.command import export_command, report_written
 from romandask.export.files import make_folder
 from romandask.export.options import ExposureNames, Folder, StoreArgument, TileBands, TileNames
 from romandask.export.planes import counted_variance, flags_of, tile_error
-from romandask.export.selection import stored_units, tile_units
+from romandask.export.selection import stored_units, tile_images
 from romandask.instruments.exposure import pixel_areas
 from romandask.model.errors import UserError
 from romandask.model.sky import ARCSEC
@@ -65,7 +66,7 @@ def export_asdf(
     if exposures:
         exposure_units = stored_units(survey.output(f"exposures/{survey_name}").product, exposures, "exposure")
     if tiles:
-        coadd_units = tile_units(survey, survey_name, tiles, bands)
+        coadd_units = tile_images(survey.output(f"coadds/{survey_name}"), tiles, bands)
     make_folder(folder)
     written = []
     if exposure_units:
@@ -77,7 +78,7 @@ def export_asdf(
     if coadd_units:
         coadds: Coadds = survey.output(f"coadds/{survey_name}")
         for index in coadd_units:
-            path = folder / f"coadd-{survey_name}-{coadds.names[index]}.asdf"
+            path = folder / f"coadd-{survey_name}-{coadds.image_names[index]}.asdf"
             _write_mosaic(path, coadds, index, survey.pipeline.name)
             written.append(path)
     return written
@@ -121,21 +122,23 @@ def _write_exposure(path: Path, exposures: Exposures, index: int) -> None:
 
 def _write_mosaic(path: Path, coadds: Coadds, index: int, survey_name: str) -> None:
     """Write a tile in one band as a level 3 mosaic."""
-    unit, instrument = coadds.tile_band(index), coadds.instrument
-    arrays = coadds.load(index, ("image", "weight", "set", "sets"))
-    sets, pointings = arrays["sets"], coadds.exposures.table.iloc[unit.members]
+    (tile, band), instrument = coadds.image_place(index), coadds.instrument
+    arrays = coadds.read(tile, band, ("image", "weight"))
+    numbers, sets = tile_sets(coadds, tile, band)
+    pointings = coadds.exposures.table.iloc[coadds.tile_members(tile, band)]
     # nJy a pixel to MJy/sr
     surface_brightness = np.float32(1e-15 / (instrument.coadd_scale**2 * ARCSEC**2))
-    error = tile_error(coadds.product, index) * surface_brightness
-    electrons_per_njy = instrument.bandpass(unit.band).ab_photons() / 3631e9
-    members = tuple(sets.drop_duplicates("input").sort_values("input")["exposure"])
+    error = tile_error(coadds, tile, band) * surface_brightness
+    electrons_per_njy = instrument.bandpass(band).ab_photons() / 3631e9
+    order = {name: rank for rank, name in enumerate(coadds.exposures.names)}
+    members = tuple(sorted(set(sets["exposure"]), key=order.__getitem__))
     bit = {name: number for number, name in enumerate(members)}
     n_sets = int(sets["set"].max() if len(sets) else 0) + 1
     masks, seconds = np.zeros((-(-max(len(members), 1) // 32), n_sets), np.uint32), np.zeros(n_sets, np.float32)
     for number, name, time in zip(sets["set"], sets["exposure"], sets["seconds"], strict=True):
         masks[bit[name] // 32, number] |= np.uint32(1 << bit[name] % 32)
         seconds[number] += time
-    exposed = seconds[arrays["set"]]
+    exposed = seconds[numbers]
     light = np.maximum(arrays["image"], 0) / np.maximum(exposed * electrons_per_njy, 1e-6) * surface_brightness**2
     planes = {
         "data": arrays["image"] * surface_brightness,
@@ -143,13 +146,13 @@ def _write_mosaic(path: Path, coadds: Coadds, index: int, survey_name: str) -> N
         "var_rnoise": error**2,
         "var_poisson": np.where(exposed > 0, light, 0).astype(np.float32),
         "weight": arrays["weight"],
-        "context": masks[:, arrays["set"]],
+        "context": masks[:, numbers],
     }
     metadata = MosaicMetadata(
         survey=survey_name,
         version=version("romandask"),
-        tile=unit.tile.name,
-        optical_element=instrument.data_model_elements[unit.band],
+        tile=coadds.tiles[tile].name,
+        optical_element=instrument.data_model_elements[band],
         pixel_scale=instrument.coadd_scale,
         native_scale=instrument.pixel_scale,
         pixfrac=coadds.settings.pixfrac,
@@ -159,6 +162,22 @@ def _write_mosaic(path: Path, coadds: Coadds, index: int, survey_name: str) -> N
         exposure_time=float(exposed[exposed > 0].mean()) if exposed.any() else 0.0,
     )
     write_mosaic(path, planes, coadds.header(index), metadata)
+
+
+def tile_sets(coadds: Coadds, tile: int, band: str) -> tuple[np.ndarray, pd.DataFrame]:
+    """Return the number of the set of exposures of each pixel of a tile, and the table of sets.
+
+    Each patch numbers its own sets; those of a tile are numbered on from one patch to the next, and 0 stays the set
+    without exposures.
+    """
+    numbers, tables, last = np.zeros(coadds.image_shape, np.int32), [], 0
+    for unit in coadds.units_of(tile, band):
+        loaded = coadds.load(unit, ("set", "sets"))
+        own, table = loaded["set"].astype(np.int32), loaded["sets"]
+        numbers[coadds.patch(unit).window] = np.where(own > 0, own + last, 0)
+        tables.append(table.assign(set=table["set"] + last))
+        last += int(own.max(initial=0))
+    return numbers, pd.concat(tables, ignore_index=True)
 
 
 @export_command("asdf")

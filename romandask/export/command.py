@@ -1,10 +1,10 @@
-"""Declaration and collection of the commands of `romandask export`."""
+"""Declaration and discovery of the commands of `romandask export`."""
 
 from __future__ import annotations
 
+import ast
 import importlib
-import pkgutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -44,8 +44,22 @@ def export_command(name: str) -> Callable[[Callable[..., None]], ExportCommand]:
     return declare
 
 
-def collect_commands(package: ModuleType) -> list[ExportCommand]:
-    """Import all modules of a package and return the commands that they declare.
+@dataclass(frozen=True)
+class DeclaredCommand:
+    """A command as the source of its module declares it."""
+
+    name: str
+    """Name on the command line."""
+    help: str
+    """Help text."""
+    module: str
+    """Module that holds the command."""
+
+
+def declared_commands(package: ModuleType) -> dict[str, DeclaredCommand]:
+    """Return the commands that the modules of a package declare, by name, without importing the modules.
+
+    The modules import the libraries of their formats, which takes seconds; their sources are parsed instead.
 
     Parameters
     ----------
@@ -54,7 +68,7 @@ def collect_commands(package: ModuleType) -> list[ExportCommand]:
 
     Returns
     -------
-    list of ExportCommand
+    dict of str to DeclaredCommand
         Commands in the order of their names.
 
     Raises
@@ -62,15 +76,30 @@ def collect_commands(package: ModuleType) -> list[ExportCommand]:
     ValueError
         If two commands have the same name.
     """
-    commands: dict[str, ExportCommand] = {}
-    for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-        for value in vars(importlib.import_module(module.name)).values():
-            if not isinstance(value, ExportCommand):
-                continue
-            # an imported command is found twice, and is the same object
-            if commands.setdefault(value.name, value) is not value:
-                raise ValueError(f"{module.name}: the command {value.name!r} is declared twice")
-    return [commands[name] for name in sorted(commands)]
+    commands: dict[str, DeclaredCommand] = {}
+    for path in sorted(path for folder in package.__path__ for path in Path(folder).glob("*.py")):
+        for name, text in _declared_in(path.read_text(encoding="utf-8")):
+            if name in commands:
+                raise ValueError(f"{path.name}: the command {name!r} is declared twice")
+            commands[name] = DeclaredCommand(name, text, f"{package.__name__}.{path.stem}")
+    return {name: commands[name] for name in sorted(commands)}
+
+
+def _declared_in(source: str) -> Iterator[tuple[str, str]]:
+    """Yield the name and the help text of each function decorated with `export_command`."""
+    if f"@{export_command.__name__}(" not in source:
+        return
+    for node in ast.parse(source).body:
+        for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+            if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == export_command.__name__:
+                assert isinstance(node, ast.FunctionDef)
+                yield ast.literal_eval(decorator.args[0]), ast.get_docstring(node) or ""
+
+
+def load_command(declared: DeclaredCommand) -> ExportCommand:
+    """Import the module of a command and return the command."""
+    values = vars(importlib.import_module(declared.module)).values()
+    return next(value for value in values if isinstance(value, ExportCommand) and value.name == declared.name)
 
 
 def report_written(paths: Iterable[Path], content: str = "") -> None:

@@ -16,7 +16,7 @@ from romandask.export.command import export_command, report_written
 from romandask.export.files import completed, make_folder
 from romandask.export.options import ExposureNames, Folder, StoreArgument, TileBands, TileNames
 from romandask.export.planes import counted_variance, flags_of, tile_error
-from romandask.export.selection import stored_units, tile_units
+from romandask.export.selection import stored_units, tile_images
 from romandask.model.errors import UserError
 from romandask.products.images import ImageProduct
 from romandask.stages.coadds.tile_maker import Coadds
@@ -102,8 +102,8 @@ def export_fits(
             images.append((name, partial(_exposure, exposure_images, index)))
     if tiles:
         coadds: Coadds = survey.output(f"coadds/{survey_name}")
-        for index in tile_units(survey, survey_name, tiles, bands):
-            images.append((f"coadd-{survey_name}-{coadds.names[index]}", partial(_tile, coadds, index)))
+        for index in tile_images(coadds, tiles, bands):
+            images.append((f"coadd-{survey_name}-{coadds.image_names[index]}", partial(_tile, coadds, index)))
     make_folder(folder)
     written = []
     for name, make_image in images:
@@ -178,27 +178,25 @@ def _exposure(exposures: Exposures, index: int) -> FitsImage:
 
 def _tile(coadds: Coadds, index: int) -> FitsImage:
     """Return the content of the file of a tile in one band."""
-    unit, scale, product = coadds.tile_band(index), coadds.instrument.coadd_scale, coadds.product
-
-    def load(name: str) -> np.ndarray:
-        return product.load(index, (name,))[name]
-
+    (tile, band), scale, product = coadds.image_place(index), coadds.instrument.coadd_scale, coadds.product
+    image = coadds.tile_image(tile, band)
     primary = {
         "TELESCOP": coadds.instrument.title,
-        "FILTER": (unit.band, "band"),
-        "TILE": (unit.tile.name, "tile of the survey's grid"),
-        "NEXP": (len(unit.members), "exposures that touch the tile"),
+        "FILTER": (band, "band"),
+        "TILE": (coadds.tiles[tile].name, "tile of the survey's grid"),
+        "NEXP": (len(coadds.tile_members(tile, band)), "exposures that touch the tile"),
         "ZPTMAG": (31.4, "AB magnitude of one nJy"),
         "PIXSCALE": (scale, "arcsec"),
     }
     weight = next(variable for variable in product.variables if variable.name == "weight")
     planes = [
-        Plane(name="SCI", make=partial(load, "image"), unit="nJy"),
-        Plane(name="ERR", make=partial(tile_error, product, index), unit="nJy"),
-        Plane(name="DQ", make=partial(load, "dq"), cards=_flag_cards(product)),
-        Plane(name="WHT", make=partial(load, "weight"), unit=str(weight.attributes["units"])),
-        Plane(name="NIMAGES", make=partial(load, "nimages")),
-        Plane(name="PSF", make=partial(load, "psf"), has_wcs=False, cards=(("PIXSCALE", scale),)),
+        Plane(name="SCI", make=partial(image, "image"), unit="nJy"),
+        Plane(name="ERR", make=partial(tile_error, coadds, tile, band), unit="nJy"),
+        Plane(name="DQ", make=partial(image, "dq"), cards=_flag_cards(product)),
+        Plane(name="WHT", make=partial(image, "weight"), unit=str(weight.attributes["units"])),
+        Plane(name="NIMAGES", make=partial(image, "nimages")),
+        # mean over the patches of the tile
+        Plane(name="PSF", make=partial(coadds.tile_psf, tile, band), has_wcs=False, cards=(("PIXSCALE", scale),)),
     ]
     return FitsImage(primary, coadds.header(index), planes)
 

@@ -23,7 +23,7 @@ from romandask.export.files import completed, make_folder
 from romandask.export.options import Bands, Folder, StoreArgument
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone
-from romandask.stages.cutouts import Wanted, located
+from romandask.stages.wanted import Wanted, located
 from romandask.survey import Survey, open_survey
 
 EMPTY = -9999

@@ -102,7 +102,7 @@ def _rows(survey: Survey, observed: ObservedImages) -> pd.DataFrame:
         ends = exposures["mjd"] + exposures["exptime"] / 86400
         rows.append(
             {
-                "obs_id": product.names[index],
+                "obs_id": images.image_names[index],
                 "stage": product.stage,
                 "calib_level": observed.calib_level,
                 "corners": observation.corners,

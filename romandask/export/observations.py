@@ -37,13 +37,12 @@ class ObservedImages:
     pixel_scale: float
     """Pixel scale, arcsec."""
     observation: Callable[[int], Observation]
-    """Returns the observation of a unit."""
+    """Returns the observation of an image."""
     psf_fwhm: Callable[[int], float]
-    """Returns the FWHM of the PSF of a unit, arcsec; NaN if it is unknown."""
+    """Returns the FWHM of the PSF of an image, arcsec; NaN if it is unknown."""
 
-    def stored(self) -> list[int]:
-        """Return the indices of the stored units."""
-        return [index for index in range(len(self.images.names)) if self.images.has(index)]
+    stored: Callable[[], list[int]]
+    """Returns the indices of the stored images."""
 
 
 def observed_images(survey: Survey) -> list[ObservedImages]:
@@ -59,7 +58,7 @@ def observed_images(survey: Survey) -> list[ObservedImages]:
 def _exposures(exposures: Exposures) -> ObservedImages:
     def observation(index: int) -> Observation:
         row = exposures.table.iloc[[index]]
-        return Observation(row, str(exposures.unit_bands[index]), exposures.footprints[index])
+        return Observation(row, str(exposures.image_bands[index]), exposures.footprints[index])
 
     return ObservedImages(
         images=exposures,
@@ -69,6 +68,7 @@ def _exposures(exposures: Exposures) -> ObservedImages:
         observation=observation,
         # the PSF of an exposure is not stored, and drawing it takes long
         psf_fwhm=lambda index: np.nan,
+        stored=lambda: [index for index in range(len(exposures.names)) if exposures.has(index)],
     )
 
 
@@ -76,11 +76,14 @@ def _coadds(coadds: Coadds) -> ObservedImages:
     scale, pointings = coadds.instrument.coadd_scale, coadds.exposures.table
 
     def observation(index: int) -> Observation:
-        unit = coadds.tile_band(index)
-        return Observation(pointings.iloc[unit.members], unit.band, coadds.footprints[index])
+        tile, band = coadds.image_place(index)
+        return Observation(pointings.iloc[coadds.tile_members(tile, band)], band, coadds.footprints[index])
 
     def psf_fwhm(index: int) -> float:
-        return _fwhm_pixels(coadds.load(index, ("psf",))["psf"]) * scale
+        return _fwhm_pixels(coadds.tile_psf(*coadds.image_place(index))) * scale
+
+    def stored() -> list[int]:
+        return [index for index in range(len(coadds.image_names)) if coadds.has_tile(*coadds.image_place(index))]
 
     return ObservedImages(
         images=coadds,
@@ -89,6 +92,7 @@ def _coadds(coadds: Coadds) -> ObservedImages:
         pixel_scale=scale,
         observation=observation,
         psf_fwhm=psf_fwhm,
+        stored=stored,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.measurement.measurement_image import errors, rms_of
 from romandask.products.images import ImageProduct
+from romandask.stages.coadds.tile_maker import Coadds
 
 
 def counted_variance(image: np.ndarray, detector: Detector) -> np.ndarray:
@@ -27,10 +28,11 @@ def counted_variance(image: np.ndarray, detector: Detector) -> np.ndarray:
     return np.maximum(image, 0).astype(np.float32) + np.float32(detector.read_noise**2)
 
 
-def tile_error(product: ImageProduct, index: int) -> np.ndarray:
+def tile_error(coadds: Coadds, tile: int, band: str) -> np.ndarray:
     """Return the standard deviation (ny, nx) of the empty pixels of a tile, nJy; 0 in pixels without an exposure."""
-    arrays = product.load(index, ("weight", "noise"))
-    return errors(arrays["weight"], rms_of(arrays["noise"][0], arrays["weight"]))[0]
+    image = coadds.tile_image(tile, band)
+    noise, weight = image("noise", (slice(0, 1), slice(None), slice(None)))[0], image("weight")
+    return errors(weight, rms_of(noise, weight))[0]
 
 
 def flags_of(product: ImageProduct) -> dict[str, int]:

@@ -41,7 +41,7 @@ def export_psf(survey: Survey, folder: Path, names: Sequence[str]) -> list[Path]
         If the survey has no such exposure, or the folder cannot be created.
     """
     product = survey.output(f"psfs/{survey.sharpest}")
-    indices = indices_of(product, names, "exposure", "this survey")
+    indices = indices_of(product.names, names, "exposure", "this survey")
     make_folder(folder)
     attributes = product.variables[0].attributes
     pointings = survey.pointings(survey.sharpest)

@@ -7,29 +7,29 @@ from collections.abc import Sequence
 
 from romandask.model.errors import UserError
 from romandask.products.images import ImageProduct
-from romandask.survey import Survey
+from romandask.stages.coadds.tile_maker import Coadds
 
 
-def indices_of(product: ImageProduct, names: Sequence[str], unit_type: str, owner: str) -> list[int]:
-    """Return the unit indices of given names, stored or not.
+def indices_of(known: Sequence[str], names: Sequence[str], unit_type: str, owner: str) -> list[int]:
+    """Return the indices of given names, stored or not.
 
     Parameters
     ----------
-    product : ImageProduct
-        Product of the units.
+    known : sequence of str
+        All names.
     names : sequence of str
-        Names of units.
+        Names that are looked up.
     unit_type : str
-        What a unit is, as the error message names it: `exposure` or `tile`.
+        What has a name, as the error message calls it: `exposure` or `tile`.
     owner : str
-        What has the units, as the error message names it, for example the name of the stage.
+        What has the names, as the error message calls it, for example the name of the stage.
 
     Raises
     ------
     UserError
-        If the product has no unit of a name; the message suggests the most similar name.
+        If there is no such name; the message suggests the most similar one.
     """
-    indices = {name: index for index, name in enumerate(product.names)}
+    indices = {name: index for index, name in enumerate(known)}
     for name in names:
         if name not in indices:
             nearest = difflib.get_close_matches(name, indices, n=1, cutoff=0.0)
@@ -42,7 +42,9 @@ def stored_units(product: ImageProduct, names: Sequence[str], unit_type: str) ->
 
     Parameters
     ----------
-    product, names, unit_type
+    product : ImageProduct
+        Product of the units.
+    names, unit_type
         As in `indices_of`.
 
     Raises
@@ -50,22 +52,20 @@ def stored_units(product: ImageProduct, names: Sequence[str], unit_type: str) ->
     UserError
         If the product has no unit of a name, or the unit is not stored.
     """
-    indices = indices_of(product, names, unit_type, product.stage)
+    indices = indices_of(product.names, names, unit_type, product.stage)
     for index in indices:
         if not product.has(index):
             raise UserError(f"{product.stage} {product.names[index]} is not stored: run the survey first")
     return indices
 
 
-def tile_units(survey: Survey, survey_name: str, tiles: Sequence[str], bands: Sequence[str]) -> list[int]:
-    """Return the unit indices of the coadds of given tiles and bands.
+def tile_images(coadds: Coadds, tiles: Sequence[str], bands: Sequence[str]) -> list[int]:
+    """Return the indices of the images of given tiles and bands, all of whose patches must be stored.
 
     Parameters
     ----------
-    survey : Survey
-        Stored survey.
-    survey_name : str
-        Name of the survey of one instrument, for example `roman`.
+    coadds : Coadds
+        Coadds of a stored survey.
     tiles : sequence of str
         Names of tiles.
     bands : sequence of str
@@ -74,11 +74,15 @@ def tile_units(survey: Survey, survey_name: str, tiles: Sequence[str], bands: Se
     Raises
     ------
     UserError
-        If the survey has no such band or tile, or the unit is not stored.
+        If there is no such band or tile, or a patch is not stored.
     """
-    known = survey.instruments[survey_name].bands
-    unknown = [band for band in bands if band not in known]
+    instrument = coadds.instrument
+    unknown = [band for band in bands if band not in instrument.bands]
     if unknown:
-        raise UserError(f"band {unknown[0]!r}: {survey_name} has {', '.join(known)}")
-    names = [f"{tile}-{band}" for tile in tiles for band in bands or known]
-    return stored_units(survey.output(f"coadds/{survey_name}").product, names, "tile")
+        raise UserError(f"band {unknown[0]!r}: {instrument.name} has {', '.join(instrument.bands)}")
+    names = [f"{tile}-{band}" for tile in tiles for band in bands or instrument.bands]
+    indices = indices_of(coadds.image_names, names, "tile", coadds.stage)
+    for name, index in zip(names, indices, strict=True):
+        if not coadds.has_tile(*coadds.image_place(index)):
+            raise UserError(f"{coadds.stage} {name} is not stored: run the survey first")
+    return indices

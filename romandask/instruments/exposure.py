@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 from numpy.polynomial.chebyshev import chebvander
+
+from romandask.kernels.detectors.chebyshev import chebyshev_surface
 
 _KNOTS = 17
 """Number of positions along each axis of a detector at which `pixel_areas` computes areas exactly."""
@@ -95,7 +99,8 @@ def pixel_areas(header: dict, shape: tuple[int, int], rows: slice = WHOLE, colum
     """Return the solid angles of the pixels of an image.
 
     The area varies smoothly (SIP of fourth order). It is computed exactly on a coarse grid of 17 x 17 pixels and
-    interpolated by Chebyshev polynomials of degree 8, with a relative accuracy better than 1e-6.
+    interpolated by Chebyshev polynomials of degree 8, with a relative accuracy better than 1e-6. A pixel has the same
+    value, to the last bit, whatever part is requested.
 
     Parameters
     ----------
@@ -110,7 +115,15 @@ def pixel_areas(header: dict, shape: tuple[int, int], rows: slice = WHOLE, colum
     -------
     ndarray, shape (rows, columns), float32, arcsec2
     """
-    wcs = WCS(header)
+    coefficients = _area_coefficients(tuple(header.items()), shape)
+    y_at, x_at = (np.arange(n)[part] * 2 / (n - 1) - 1 for n, part in zip(shape, (rows, columns), strict=True))
+    return chebyshev_surface(chebvander(y_at, _DEGREE), coefficients, chebvander(x_at, _DEGREE).T.astype(np.float32))
+
+
+@lru_cache(maxsize=256)
+def _area_coefficients(cards: tuple[tuple[str, Any], ...], shape: tuple[int, int]) -> np.ndarray:
+    """Return the coefficients of the Chebyshev polynomials of `pixel_areas`, given the cards of the header."""
+    wcs = WCS(dict(cards))
     ys, xs = (np.linspace(0, n - 1, _KNOTS) for n in shape)
     x, y = np.meshgrid(xs, ys)
     sides = {}
@@ -126,8 +139,4 @@ def pixel_areas(header: dict, shape: tuple[int, int], rows: slice = WHOLE, colum
     (x_east, x_north), (y_east, y_north) = offset_between("left", "right"), offset_between("bottom", "top")
     area = np.abs(x_east * y_north - x_north * y_east)
     y_terms, x_terms = (chebvander(2 * axis / axis[-1] - 1, _DEGREE) for axis in (ys, xs))
-    coefficients = np.linalg.pinv(y_terms) @ area @ np.linalg.pinv(x_terms).T
-    y_at, x_at = (np.arange(n)[part] * 2 / (n - 1) - 1 for n, part in zip(shape, (rows, columns), strict=True))
-    return (chebvander(y_at, _DEGREE) @ coefficients).astype(np.float32) @ chebvander(x_at, _DEGREE).T.astype(
-        np.float32
-    )
+    return np.linalg.pinv(y_terms) @ area @ np.linalg.pinv(x_terms).T

@@ -169,6 +169,12 @@ class CoaddSettings(Section):
     overlap: int = Field(500, ge=0, description="padding on each edge of a tile, pixels")
     pixfrac: float = Field(0.7, gt=0, le=1, description="drizzle drop size, in units of the input pixel")
     noise: int = Field(1, ge=1, le=20, description="number of noise realisations of each tile and band")
+    patch_pixels: int = Field(
+        2048,
+        ge=32,
+        description="approximate side of a patch, pixels of the coadd; tiles are made, stored and measured by patches, "
+        "and the memory of a worker grows with their area",
+    )
 
     @model_validator(mode="after")
     def _has_inside(self) -> CoaddSettings:

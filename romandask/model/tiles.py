@@ -80,6 +80,56 @@ def tangent_header(ra: float, dec: float, pixels: int, scale: float) -> dict[str
 
 
 @dataclass(frozen=True)
+class PatchGrid:
+    """The division of a square image into square patches.
+
+    Patches have an even number of pixels a side, so that each consists of 2 x 2 chunks. The last row and column of
+    patches may be narrower.
+    """
+
+    pixels: int
+    """Side of the image, pixels."""
+    patch_pixels: int
+    """Approximate side of a patch, pixels."""
+
+    @property
+    def side(self) -> int:
+        """Side of a patch, pixels; even."""
+        return 2 * -(-self.pixels // (2 * max(1, round(self.pixels / self.patch_pixels))))
+
+    @property
+    def count(self) -> int:
+        """Number of rows, and of columns, of patches."""
+        return -(-self.pixels // self.side)
+
+    def window(self, row: int, column: int) -> tuple[slice, slice]:
+        """Return the rows and columns of the image that a patch covers."""
+        rows, columns = (slice(k * self.side, min((k + 1) * self.side, self.pixels)) for k in (row, column))
+        return rows, columns
+
+    def centre(self, row: int, column: int) -> tuple[float, float]:
+        """Return x and y of the centre of a patch, 0 at the centre of the first pixel of the image."""
+        rows, columns = self.window(row, column)
+        return (columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2
+
+    def touching(self, window: tuple[slice, slice]) -> list[tuple[int, int]]:
+        """Return row and column of the patches that have pixels in a window of the image, in order."""
+        rows, columns = (range(*part.indices(self.pixels)) for part in window)
+        if not rows or not columns:
+            return []
+        return [
+            (row, column)
+            for row in range(rows[0] // self.side, rows[-1] // self.side + 1)
+            for column in range(columns[0] // self.side, columns[-1] // self.side + 1)
+        ]
+
+    @staticmethod
+    def name(row: int, column: int) -> str:
+        """Return the name of a patch, which ends the names of units: r<row>c<column>."""
+        return f"r{row}c{column}"
+
+
+@dataclass(frozen=True)
 class TileGrid:
     """The tile grid of a survey, common to all instruments."""
 

@@ -9,7 +9,9 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
+from romandask.model.tiles import PatchGrid
 from romandask.products.images import ImageProduct
+from romandask.products.mosaic import Mosaic
 from romandask.products.units import Made, Unit
 from romandask.storage.store import Store
 
@@ -57,6 +59,15 @@ class ImageSet:
     def load(self, index: int, names: tuple[str, ...] | None = None, window: tuple[slice, ...] = ()) -> dict[str, Any]:
         """Return arrays and tables of a unit: see `ImageProduct.load`."""
         return self.product.load(index, names, window)
+
+    @property
+    def patches(self) -> PatchGrid | None:
+        """Division of the images into patches, each of which is a unit; None if an image is one unit."""
+        return self.product.patches
+
+    def image(self, *place: int) -> Mosaic:
+        """Return a reader of windows of a whole image across its patches: see `ImageProduct.image`."""
+        return self.product.image(*place)
 
     def reader(self, index: int) -> Callable[[str, tuple[slice, ...]], np.ndarray]:
         """Return a reader of windows of the arrays of a stored unit: see `ImageProduct.reader`."""

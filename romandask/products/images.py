@@ -9,17 +9,19 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
-import dask
-import dask.array as da
 import numpy as np
 import pyarrow as pa
 import xarray as xr
 import zarr
 
 from romandask.model.errors import UserError
+from romandask.model.tiles import PatchGrid
+from romandask.products.lazy_dataset import Coordinates, lazy_dataset
+from romandask.products.mosaic import Mosaic, evaluated, from_memory
 from romandask.products.tables import conform, to_frame
 from romandask.products.units import Made, Unit, names_of
 from romandask.storage.arrays import (
+    Layout,
     Variable,
     limited_concurrency,
     open_images,
@@ -33,11 +35,7 @@ from romandask.storage.manifest import digest, read_record
 from romandask.storage.paths import AnyPath
 from romandask.storage.store import Store, read_parquet, write_parquet
 
-LONGEST_SHOWN_TEXT = 100
-"""Characters up to which a text coordinate is shown in the repr of a dataset."""
 _NO_TABLES: Mapping[str, bytes] = MappingProxyType({})
-Coordinates = dict[str, tuple[tuple[str, ...], np.ndarray, dict]]
-"""Axes, values and attributes of each coordinate, by name."""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -73,6 +71,10 @@ class ImageProduct:
     """Makes the arrays of a unit one after another, for units that do not fit the memory of a worker as a whole."""
     tables: dict[str, pa.Schema] = field(default_factory=dict)
     """Schemas, by name, of tables that `make` returns in addition to the arrays; they may have any number of rows."""
+    patches: PatchGrid | None = None
+    """Division of images into patches. With it a unit is one patch, and the units are in C order along `axes`, patch
+    row and patch column. An image (a variable with the axes y and x; its shape is that of the whole image) is stored as
+    one array, of which each unit makes and writes the part in its patch. Other variables belong to a patch."""
 
     def __repr__(self) -> str:
         # the generated repr would include `make`, and through it all upstream products
@@ -106,7 +108,7 @@ class ImageProduct:
         names : tuple of str, optional
             Names of the arrays, and of tables, to return; by default all arrays and no table.
         window : tuple of slice
-            Window of the last axes of each array; by default the full array. Tables are always complete.
+            Window of the last axes of each array of the unit; by default the full array. Tables are always complete.
         """
         wanted = [variable.name for variable in self.variables if names is None or variable.name in names]
         tables = [name for name in self.tables if name in (names or ())]
@@ -117,7 +119,7 @@ class ImageProduct:
             return {**{name: read(name, window) for name in wanted}, **frames}
         made = self.make(index)
         return {
-            **{name: _evaluated(made[name])[(..., *window)] for name in wanted},
+            **{name: evaluated(made[name])[(..., *window)] for name in wanted},
             **{name: made[name] for name in tables},
         }
 
@@ -132,13 +134,12 @@ class ImageProduct:
         """
         assert self.store is not None
         group = read_group(self.store.images(self.stage))
-        unit_index = self._unit_index(unit)
         opened: dict[str, zarr.Array] = {}
 
         def read(name: str, window: tuple[slice, ...] = ()) -> np.ndarray:
             if name not in opened:
                 opened[name] = _array(group, name)
-            index: Any = (*unit_index, ..., *window)
+            index: Any = self.layout.stored_index(name, unit, window)
             # arrays without shards are not compressed, so reading many of their chunks at a time takes little memory
             with self._damage_reported(name, unit), limited_concurrency() if opened[name].shards else nullcontext():
                 return np.asarray(opened[name][index])
@@ -158,21 +159,22 @@ class ImageProduct:
     @property
     def stored_bytes(self) -> int:
         """Uncompressed bytes of the images of all units."""
-        one = sum(int(np.prod(v.shape)) * np.dtype(v.dtype).itemsize for v in self.variables)
-        return one * len(self.units)
+        leading = {v.name: self.layout.leading(v)[1] for v in self.variables}
+        return sum(int(np.prod((*leading[v.name], *v.shape))) * np.dtype(v.dtype).itemsize for v in self.variables)
 
     def metadata_files(self, store: Store) -> list[AnyPath]:
         """Return the stored files that belong to no unit: metadata of the arrays, and coordinates."""
         return image_metadata_files(store, self.stage, [variable.name for variable in self.variables])
 
     def prepare(self, store: Store) -> None:
-        """Create the arrays that units are written into, and write the coordinates."""
+        """Create the arrays that units are written into, and write the coordinates; leave what is stored already."""
         if not self.units:
             return
-        group = open_images(store.images(self.stage), self.variables, self.lengths, self.axes)
+        group = open_images(store.images(self.stage), self.layout)
         for name, (axes, values, attributes) in self.coordinates().items():
             write_coordinate(group, name, values, axes, attributes)
-        group.attrs.update(self.attributes)
+        if any(group.attrs.get(key) != value for key, value in self.attributes.items()):
+            group.attrs.update(self.attributes)
 
     def write(self, index: int, store: Store) -> Made:
         """Make one unit and write it. No other unit shares its shards, so units can be written concurrently."""
@@ -188,7 +190,7 @@ class ImageProduct:
         }
         # each array is freed once it is written
         return self._write_arrays(
-            ((v.name, _evaluated(arrays.pop(v.name))) for v in self.variables), index, store, tables
+            ((v.name, evaluated(arrays.pop(v.name))) for v in self.variables), index, store, tables
         )
 
     def verify(self, index: int, store: Store) -> str:
@@ -209,16 +211,16 @@ class ImageProduct:
         variables = {variable.name: variable for variable in self.variables}
         parts, size, rows = {name: digest(content) for name, content in tables.items()}, 0, 0
         group = write_group(store.images(self.stage))
-        unit_index = self._unit_index(index)
         for name, array in arrays:
             variable = variables.pop(name)
-            if array.shape != variable.shape or not np.isfinite(array).all():
+            lead, corner, shape = self.layout.location(variable, index)
+            if array.shape != shape or not np.isfinite(array).all():
                 raise ValueError(
                     f"{self.stage} {self.names[index]}: {variable.name} has shape {array.shape}, expected "
-                    f"{variable.shape}, or values that are not finite"
+                    f"{shape}, or values that are not finite"
                 )
             array = array.astype(variable.dtype, copy=False)
-            write_array(_array(group, variable.name), unit_index, array)
+            write_array(_array(group, variable.name), lead, array, corner)
             parts[name] = digest(array)
             size, rows = size + array.nbytes, max(rows, array.size)
             del array
@@ -226,59 +228,28 @@ class ImageProduct:
             raise ValueError(f"{self.stage} {self.names[index]}: {', '.join(variables)} were not made")
         return Made(digest(parts), size, rows)
 
-    def _unit_index(self, index: int) -> tuple[int, ...]:
-        """Return the indices of a unit along the axes over units."""
-        return tuple(int(k) for k in np.unravel_index(index, self.lengths))
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the values of each unit are in the stored arrays."""
+        return Layout(self.variables, self.axes, self.lengths, self.patches)
+
+    def image(self, *place: int) -> Mosaic:
+        """Return a reader of windows of a whole image, across its patches.
+
+        Parameters
+        ----------
+        *place : int
+            Indices of the image along `axes`.
+        """
+        return Mosaic(
+            self.layout, place, lambda unit: self.reader(unit) if self.has(unit) else from_memory(self.make(unit))
+        )
 
     @cached_property
     def dataset(self) -> xr.Dataset:
         """The lazy dataset, with one chunk per unit. The variables of a unit are read or made together, once."""
-        chunks = tuple((1,) * length for length in self.lengths)
         name = f"{self.stage.replace('/', '-')}-" + digest([unit.settings for unit in self.units])
-        source = dask.delayed(self, name=f"{name}-product", traverse=False)
-        bundles = da.map_blocks(
-            _load_block,
-            source,
-            self.lengths,
-            chunks=chunks,
-            dtype=object,
-            name=f"{name}-unit",
-            meta=np.empty((0,) * len(chunks), object),
-        )
-        data = {}
-        for variable in self.variables:
-            data[variable.name] = (
-                (*self.axes, *variable.axes),
-                da.map_blocks(
-                    _pick,
-                    bundles,
-                    variable.name,
-                    chunks=chunks + tuple((length,) for length in variable.shape),
-                    new_axis=list(range(len(chunks), len(chunks) + len(variable.shape))),
-                    dtype=variable.dtype,
-                    meta=np.empty((0,) * (len(chunks) + len(variable.shape)), variable.dtype),
-                    name=f"{name}-{variable.name}",
-                ),
-                variable.attributes,
-            )
-        coordinates = {
-            key: (axes, _coordinate_values(values), attributes)
-            for key, (axes, values, attributes) in self.coordinates().items()
-        }
-        return xr.Dataset(data, coordinates, self.attributes)
-
-
-def _coordinate_values(values: np.ndarray) -> Any:
-    """Return the values of a coordinate as xarray takes them: long texts, which would fill a repr, as a lazy array."""
-    if values.dtype != object:
-        return values
-    texts = values.astype(str)
-    return da.from_array(texts, chunks=-1) if texts.dtype.itemsize > 4 * LONGEST_SHOWN_TEXT else texts
-
-
-def _evaluated(array: Any) -> Any:
-    """Return an array, or the result of the function that makes it."""
-    return array() if callable(array) else array
+        return lazy_dataset(name, self.layout, self, self.coordinates(), self.attributes)
 
 
 def table_beside(store: Store, stage: str, name: str, unit: str) -> AnyPath:
@@ -290,13 +261,3 @@ def _array(group: zarr.Group, name: str) -> Any:
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array
-
-
-def _load_block(product: ImageProduct, lengths: tuple[int, ...], block_id: tuple[int, ...] = ()) -> np.ndarray:
-    bundle = np.empty((1,) * len(lengths), object)
-    bundle.flat[0] = product.load(int(np.ravel_multi_index(block_id, lengths)))
-    return bundle
-
-
-def _pick(bundle: np.ndarray, name: str) -> np.ndarray:
-    return bundle.flat[0][name][(None,) * bundle.ndim]

@@ -133,9 +133,7 @@ def field(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         half = int(FIELD_HALF_SIDE / instrument.coadd_scale)
         side = coadds.pixels
         window = tuple(slice(max(pixel - half, 0), min(pixel + half + 1, side)) for pixel in (v, u))
-        images[key] = {
-            band: coadds.load(coadds.index(tile, band), ("image",), window)["image"] for band in instrument.bands
-        }
+        images[key] = {band: coadds.read(tile, band, ("image",), window)["image"] for band in instrument.bands}
     marks = {}
     for part, key in (("sharp", pair.sharp), ("blended", pair.blended)):
         own = (in_tile["survey"] == key).to_numpy()
@@ -199,7 +197,7 @@ def difference_images(survey: Survey) -> str:
     tile = int(np.argmax([len(residuals) for residuals in tables]))
     arrays = product.load(tile)
     coadds = survey.output(f"coadds/{name}")
-    science = coadds.load(coadds.index(tile, settings.science), ("image",))["image"]
+    science = coadds.read(tile, settings.science, ("image",))["image"]
     count = int(DIFFERENCE_HALF_SIDE / instrument.coadd_scale)
     middle = science.shape[0] // 2
     part = (slice(max(middle - count, 0), middle + count),) * 2

@@ -81,7 +81,7 @@ def _sky(survey: Survey, objects: dict[str, pd.DataFrame], tile: int) -> str:
         coadds = survey.output(f"coadds/{name}")
         bands = {}
         for position, band in enumerate(instrument.bands):
-            arrays = coadds.load(coadds.index(tile, band), ("image", "weight", "nimages"))
+            arrays = coadds.read(tile, band, ("image", "weight", "nimages"))
             bands[band] = arrays["image"]
             if position == len(instrument.bands) // 2:
                 layers[name] = (arrays["weight"], arrays["nimages"], band)

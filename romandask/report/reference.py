@@ -60,7 +60,10 @@ def _images() -> list[str]:
 def _image(product: ImageProduct) -> str:
     rows = []
     for variable in product.variables:
-        axes = [*product.axes, *(f"{axis} {size}" for axis, size in zip(variable.axes, variable.shape, strict=True))]
+        axes = [
+            *product.layout.leading(variable)[0],
+            *(f"{axis} {size}" for axis, size in zip(variable.axes, variable.shape, strict=True)),
+        ]
         attributes = dict(variable.attributes)
         text = str(attributes.get("long_name", ""))
         if "flag_masks" in attributes:

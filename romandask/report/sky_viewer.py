@@ -85,7 +85,7 @@ class Layer:
     def numbers(self) -> dict[int, int]:
         """Numbers of the tiles whose three bands are stored, by tile id."""
         numbers = {tile.id: number for number, tile in enumerate(self.coadds.tiles)}
-        return {key: k for key, k in numbers.items() if all(self.coadds.has(self.unit(k, b)) for b in self.bands)}
+        return {key: k for key, k in numbers.items() if all(self.coadds.has_tile(k, b) for b in self.bands)}
 
     @cached_property
     def noise(self) -> dict[str, float]:
@@ -93,11 +93,7 @@ class Layer:
         middle = sorted(self.numbers.values())[len(self.numbers) // 2]
         first = max(0, (self.coadds.pixels - _NOISE_SAMPLE) // 2)
         window = (slice(first, first + _NOISE_SAMPLE),) * 2
-        return {b: noise_of(self.coadds.load(self.unit(middle, b), ("image",), window)["image"]) for b in self.bands}
-
-    def unit(self, tile: int, band: str) -> int:
-        """Return the unit number of a tile and band."""
-        return self.coadds.index(tile, band)
+        return {b: noise_of(self.coadds.read(middle, b, ("image",), window)["image"]) for b in self.bands}
 
     def sampled(self, row: int, column: int) -> np.ndarray:
         """Return a picture of the lowest level in units of the noise.
@@ -123,7 +119,7 @@ class Layer:
             window = slice(y.min(), y.max() + 1), slice(x.min(), x.max() + 1)
             # a band that is used for several colours is read once
             for band, noise in self.noise.items():
-                arrays = self.coadds.load(self.unit(tile, band), ("image", "weight"), window)
+                arrays = self.coadds.read(tile, band, ("image", "weight"), window)
                 values = np.where(arrays["weight"] > 0, arrays["image"] / noise, np.nan)
                 for plane in (plane for plane, name in zip(out, self.bands, strict=True) if name == band):
                     plane.flat[pixels] = values[y - window[0].start, x - window[1].start]

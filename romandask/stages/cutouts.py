@@ -16,17 +16,14 @@ from astropy.wcs import WCS
 from romandask.kernels.detectors.simple_detector import NO_DATA
 from romandask.kernels.rendering.scene import pixel_positions
 from romandask.model.errors import UserError
-from romandask.model.sky import Cone, Region, covering_pairs
+from romandask.model.sky import covering_pairs
 from romandask.products.images import ImageProduct
-from romandask.products.tables import TableProduct
 from romandask.storage.manifest import digest
 
 LARGEST_CUTOUT_PIXELS = 256
 """Largest side of a cutout, pixels."""
 _FOOTPRINT_MARGIN = 1.0
 """Margin, arcsec, of the search by footprints, whose edges are great circles; the WCS then decides what is inside."""
-Wanted = Sequence[int] | np.ndarray | pd.DataFrame | Region | Cone
-"""Selection of objects: their ids, a table with the columns id, ra and dec (degrees), or an area on the sky."""
 
 
 @dataclass(frozen=True)
@@ -38,29 +35,18 @@ class Layer:
     """Attributes of the xarray variable: units, long_name, ..."""
 
 
-@dataclass(frozen=True)
-class Positions:
-    """A table of objects, and the names of its columns with ids and positions."""
-
-    product: TableProduct
-    """The table."""
-    id: str
-    """Column of the id."""
-    ra: str
-    """Column of the right ascension, degrees."""
-    dec: str
-    """Column of the declination, degrees."""
-
-    def named(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """Return the three columns of rows of the table, renamed to id, ra and dec."""
-        return rows[[self.id, self.ra, self.dec]].set_axis(["id", "ra", "dec"], axis=1)
-
-
 class Images(Protocol):
     """The images of exposures or coadds that cutouts are made from. `Exposures` and `Coadds` implement it."""
 
     product: ImageProduct
-    """The lazy images; one image per unit."""
+    """The lazy images; an image is a unit, or all patches of a tile in a band."""
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of the images."""
+
+    def load_image(self, image: int, names: tuple[str, ...], window: tuple[slice, ...] = ()) -> dict[str, np.ndarray]:
+        """Return a window of arrays of an image, by name."""
 
     @property
     def footprints(self) -> np.ndarray:
@@ -71,7 +57,7 @@ class Images(Protocol):
         """Rows and columns of an image."""
 
     @property
-    def unit_bands(self) -> np.ndarray:
+    def image_bands(self) -> np.ndarray:
         """Band of each image, shape (n,)."""
 
     @property
@@ -120,50 +106,6 @@ class CutoutPositions:
     """Derivative of (west, north), GalSim's frame, with respect to (x, y), shape (n, 2, 2), arcsec/pixel."""
 
 
-def located(of: Wanted, tables: Sequence[Positions], catalog: str) -> pd.DataFrame:
-    """Return id, ra and dec of selected objects.
-
-    Parameters
-    ----------
-    of : Wanted
-        Selection of objects.
-    tables : sequence of Positions
-        Tables in which ids and areas on the sky are looked up.
-    catalog : str
-        Name of the tables in error messages.
-
-    Returns
-    -------
-    DataFrame
-        One row per object, in the order of the ids (without repetitions), or in the order of the tables.
-
-    Raises
-    ------
-    UserError
-        If an id is in none of the tables, ids are not integers, or a column of a given table is missing.
-    """
-    if isinstance(of, pd.DataFrame):
-        missing = sorted({"id", "ra", "dec"} - set(of.columns))
-        if missing:
-            raise UserError(f"table of objects: columns {', '.join(missing)} are missing")
-        return of[["id", "ra", "dec"]].reset_index(drop=True)
-    if isinstance(of, Region | Cone):
-        parts = [table.named(table.product.rows_within(of, table.ra, table.dec)) for table in tables]
-        return pd.concat(parts, ignore_index=True)
-    ids = np.asarray(of).ravel()
-    if ids.size and ids.dtype.kind not in "iu":
-        raise UserError(f"ids of objects are whole numbers, found {ids.dtype}")
-    ids = pd.unique(ids.astype(np.int64))
-    columns = [[table.id, table.ra, table.dec] for table in tables]
-    parts = [t.named(t.product.rows_where(t.id, ids, names)) for t, names in zip(tables, columns, strict=True)]
-    rows = pd.concat(parts, ignore_index=True)
-    absent = np.setdiff1d(ids, rows["id"])
-    if len(absent):
-        raise UserError(f"{len(absent)} of {len(ids)} ids are not in {catalog}, the first is {absent[0]}")
-    rank = pd.Series(np.arange(len(ids)), index=ids).loc[rows["id"]].to_numpy()
-    return rows.iloc[np.argsort(rank, kind="stable")].reset_index(drop=True)
-
-
 def cutouts(
     images: Images,
     objects: pd.DataFrame,
@@ -194,15 +136,15 @@ def cutouts(
     UserError
         If there is no such layer or band, or the size is not allowed.
     """
-    product, unit_bands = images.product, images.unit_bands
-    known_bands = sorted(set(unit_bands.tolist()))
+    product, image_bands = images.product, images.image_bands
+    known_bands = sorted(set(image_bands.tolist()))
     for band in bands or ():
         if band not in known_bands:
             raise UserError(f"band {band!r}: the images have {', '.join(known_bands)}")
     if not 8 <= size <= LARGEST_CUTOUT_PIXELS or size % 2:
         raise UserError(f"size {size}: an even number of pixels from 8 to {LARGEST_CUTOUT_PIXELS}")
-    chosen = np.flatnonzero(np.isin(unit_bands, bands or known_bands))
-    known = {v.name: Layer(v.dtype, v.attributes) for v in product.variables if v.axes[-2:] == ("y", "x")}
+    chosen = np.flatnonzero(np.isin(image_bands, bands or known_bands))
+    known = {v.name: Layer(v.dtype, v.attributes) for v in product.variables if v.is_image}
     known |= {
         name: Layer(dtype, {"units": unit, "long_name": text})
         for name, (dtype, unit, text) in images.extra_layers.items()
@@ -270,7 +212,7 @@ def _dataset(
     used, counts = np.unique(positions.image, return_counts=True)
     data = {}
     if len(used):
-        settings = [product.units[unit].settings for unit in used.tolist()]
+        settings = _settings(product, used)
         token = digest(product.stage, positions.image, positions.x, positions.y, size, sorted(layers), settings)
         task = f"{product.stage.replace('/', '-')}-cutouts-{token}"
         cut = CutImage(images, used, _per_image(positions, used), tuple(layers), size)
@@ -293,7 +235,7 @@ def _dataset(
             )
         axis_names = ("v", "u") if name == "psf" else ("y", "x")
         data[name] = ((*axes, *axis_names), array, layer.attributes)
-    unit_names = np.array(product.names, object)[positions.image]
+    unit_names = np.array(images.image_names, object)[positions.image]
     degrees = {"units": "deg"}
     on_image = {"units": "pixel", "description": "on the whole image, 0 at the centre of the first pixel"}
     first_pixel = {"units": "pixel", "description": "of the first pixel of the cutout, on the whole image"}
@@ -304,7 +246,7 @@ def _dataset(
         "ra": (axes, objects["ra"].to_numpy(float)[positions.row], degrees),
         "dec": (axes, objects["dec"].to_numpy(float)[positions.row], degrees),
         "unit": (axes, unit_names.astype(str), {"description": "image: exposure, or tile and band"}),
-        "band": (axes, images.unit_bands[positions.image].astype(str), {}),
+        "band": (axes, images.image_bands[positions.image].astype(str), {}),
         "x_image": (axes, positions.x, on_image),
         "y_image": (axes, positions.y, on_image),
         "column": (axes, positions.corner[:, 0], first_pixel),
@@ -312,6 +254,12 @@ def _dataset(
         "jacobian": ((*axes, "sky", "pixel"), positions.jacobian, derivative),
     }
     return xr.Dataset(data, coordinates, {"survey": product.attributes.get("survey", ""), "size": size})
+
+
+def _settings(product: ImageProduct, used: np.ndarray) -> list[Any]:
+    """Return the settings of the units of some images: of all their patches, if they are divided."""
+    parts = 1 if product.patches is None else product.patches.count**2
+    return [product.units[image * parts + k].settings for image in used.tolist() for k in range(parts)]
 
 
 def _per_image(positions: CutoutPositions, used: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
@@ -327,7 +275,7 @@ class CutImage:
 
     images: Images
     units: np.ndarray
-    """Index in the product of each image that has cutouts, shape (images,)."""
+    """Index of each image that has cutouts, shape (images,)."""
     positions: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Positions of the objects and corners of the cutouts on each of these images, each (n, 2), pixels."""
     layers: tuple[str, ...]
@@ -339,7 +287,7 @@ class CutImage:
         """Return the layers, each (n, size, size), of the cutouts of one of the images that have cutouts."""
         unit, (xy, corners) = int(self.units[number]), self.positions[number]
         product = self.images.product
-        stored_layers = {v.name: v.shape[-2:] for v in product.variables if v.axes[-2:] == ("y", "x")}
+        stored_layers = {v.name: v.shape[-2:] for v in product.variables if v.is_image}
         shape = next(iter(stored_layers.values()))
         low = np.clip(corners.min(axis=0), 0, np.array(shape[::-1]))
         high = np.clip(corners.max(axis=0) + self.size, 0, np.array(shape[::-1]))
@@ -347,7 +295,7 @@ class CutImage:
         wanted = {name for name in self.layers if name in stored_layers}
         if "weight" in self.layers:
             wanted |= {"dq", "image", "variance"}
-        arrays = product.load(unit, tuple(sorted(wanted & set(stored_layers))), window) if wanted else {}
+        arrays = self.images.load_image(unit, tuple(sorted(wanted & set(stored_layers))), window) if wanted else {}
         # of several noise realisations, the first
         arrays = {name: plane if plane.ndim == 2 else plane[0] for name, plane in arrays.items()}
         arrays |= self.images.make_layers(unit, self.layers, window, arrays)

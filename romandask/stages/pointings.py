@@ -193,7 +193,7 @@ def build_pointings(context: SurveyContext, survey: str) -> TableProduct:
         "settings": block.model_dump(),
         "region": pipeline.region.model_dump(),
         "seed": pipeline.seed,
-        "coadds": pipeline.coadds.model_dump(exclude={"pixfrac"}),
+        "coadds": pipeline.coadds.model_dump(exclude={"pixfrac", "patch_pixels"}),
         "source": _source_state(context.data, block.pointings.path),
     }
     maker = MakePointings(

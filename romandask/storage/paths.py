@@ -18,6 +18,7 @@ from typing import Any
 
 from upath import UPath
 
+from romandask.model.cache import cache_folder
 from romandask.model.errors import UserError
 
 AnyPath = Path
@@ -88,13 +89,20 @@ def resolve_below(folder: AnyPath, text: str | AnyPath) -> AnyPath:
 def local_copy(path: AnyPath) -> Path:
     """Return a local file with the content of a path: the path itself, or a cached copy of an object.
 
-    Copies are cached under the object's URL and its ETag, size and time in the folder `romandask` of the user's cache
-    (XDG_CACHE_HOME), so that the processes of one machine fetch an object once.
+    Copies are cached under the object's URL and its ETag, size and time (see `romandask.model.cache.cache_folder`), so
+    that the processes of one machine fetch an object once.
+
+    Raises
+    ------
+    UserError
+        If there is no folder that can be written.
     """
     if isinstance(path, Path):
         return path
     tag = hashlib.blake2b(f"{path}\n{_tag(path)}".encode(), digest_size=12).hexdigest()
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "romandask" / "inputs"
+    cache = cache_folder("inputs")
+    if cache is None:
+        raise UserError(f"{path}: there is no folder for a copy: set XDG_CACHE_HOME to one that can be written")
     copy = cache / tag / path.name
     if not copy.exists():
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -111,6 +119,15 @@ def file_state(path: AnyPath) -> list[int]:
     """Return the size (bytes) and the modification time (ns) of a file, by which changes are detected."""
     status = path.stat()
     return [int(status.st_size), int(status.st_mtime_ns)]
+
+
+def modification_time(path: AnyPath) -> float:
+    """Return the modification time of a file, s, by the clock of the computer that holds it."""
+    if not isinstance(path, Path):
+        return float(path.fs.modified(path.path).timestamp())
+    # a network file system asks its server for the state of a file that is opened
+    with open(path, "rb") as file:
+        return os.fstat(file.fileno()).st_mtime
 
 
 def write_bytes(path: AnyPath, content: bytes) -> None:

@@ -2,7 +2,10 @@
 
 import gc
 import os
+import re
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -187,3 +190,20 @@ def test_a_client_that_finds_no_scheduler_is_collected_at_once():
         assert not [item for item in gc.get_objects() if isinstance(item, Client)]
     finally:
         gc.enable()
+
+
+@pytest.mark.slow
+def test_a_script_without_a_main_guard_is_told_so(tmp_path):
+    """Each worker runs the script again before it starts."""
+    lines = ["from romandask.engine.clients import runner", "with runner(2, 1.5):", '    print("started")']
+    (tmp_path / "script.py").write_text("\n".join(lines))
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert re.search(r"UserError: .*script\.py: worker processes import this script.* if __name__ == ", last)
+    assert done.stderr.count("Traceback") == 1, "only that of the script itself"
+    assert done.stdout == ""
+    guarded = "\n".join([lines[0], 'if __name__ == "__main__":', *(f"    {line}" for line in lines[1:])])
+    (tmp_path / "script.py").write_text(guarded)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "started\n", "")

@@ -11,7 +11,7 @@ import pytest
 from conftest import command
 from rich.console import Console
 
-from romandask.cli import main as cli
+from romandask import survey
 from romandask.cli.main import main
 from romandask.engine import progress
 from romandask.engine.event_log import Log, events, newest_event, runs
@@ -82,7 +82,7 @@ def test_a_long_activity_is_printed_repeatedly(monkeypatch):
 
 @pytest.mark.parametrize(
     ("words", "module", "text"),
-    [(["plan", "tiny"], cli, "planning: "), (["export", "obseq", "tiny", "o.fits"], obseq, "exporting: ")],
+    [(["plan", "tiny"], survey, "planning: "), (["export", "obseq", "tiny", "o.fits"], obseq, "exporting: ")],
 )
 def test_a_long_command_prints_its_activity(words, module, text, monkeypatch, tmp_path, capsys):
     """The construction of the survey waits for the first output, so the speed of the command does not matter."""

@@ -15,10 +15,14 @@ import yaml
 from conftest import MINI, command
 
 from romandask.cli.main import main
+from romandask.engine.staleness import StoredOutputs, find_stale, write_failure
 from romandask.engine.verify import OTHER_FILES
 from romandask.model.errors import UserError
 from romandask.model.seeds import rng
+from romandask.products.tables import TableProduct
+from romandask.products.units import Unit
 from romandask.run import verify_store
+from romandask.storage.checksums import damaged_files
 from romandask.storage.manifest import digest
 from romandask.storage.store import Store, refuse_full
 from romandask.survey import open_survey
@@ -72,8 +76,11 @@ def test_an_undamaged_store_is_verified(store):
     assert {"exposures/roman", "coadds/rubin", "truth/galaxies_margin", "matches/groups"} <= stages
 
 
-def test_every_flipped_bit_and_every_truncation_is_found(store):
-    """At least one file of each kind is damaged, one at a time, at a random position."""
+def test_every_damage_is_found(store):
+    """At least one file of each kind is changed, truncated, emptied or removed, one at a time.
+
+    A unit without a record is not stored, and a stage without checksums is not finished: these are no damage.
+    """
     random, files = rng(1, "flips"), stored(store)
     kinds: dict[tuple, list[Path]] = {}
     for path in files:
@@ -86,12 +93,16 @@ def test_every_flipped_bit_and_every_truncation_is_found(store):
         position = int(random.integers(len(content)))
         if number % 5 == 4:
             path.write_bytes(content[:position])
+        elif number % 5 == 3:
+            path.write_bytes(b"")
+        elif number % 5 == 2 and path.relative_to(store).parts[0] != "manifest":
+            path.unlink()
         else:
             changed = bytearray(content)
             changed[position] ^= 1 << int(random.integers(8))
             path.write_bytes(changed)
         if path.name == "pipeline.yaml":
-            found = ["pipeline.yaml"] if digest(path.read_bytes()) != digest(content) else []
+            found = damaged_files(Store(store), "store")
         else:
             found = damaged(store, stage_of(store, path))
         if not found:
@@ -101,38 +112,128 @@ def test_every_flipped_bit_and_every_truncation_is_found(store):
     assert len(chosen) >= DAMAGED_FILES
 
 
-def test_missing_files_are_found_and_made_again_with_the_same_bytes(store, tmp_path):
-    """A chunk, a partition and the metadata of a catalog are removed and a record is changed; a new run makes them."""
-    copy = tmp_path / "s"
-    shutil.copytree(store, copy)
-    before = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
-    chunk = next(
-        path
-        for path in sorted((copy / "coadds" / "rubin.zarr" / "image").rglob("*"))
-        if path.name != "zarr.json" and path.is_file()
-    )
-    table = next((copy / "objects" / "roman" / "catalog" / "dataset").rglob("*.parquet"))
-    record = next((copy / "manifest" / "detections" / "roman").glob("*.json"))
-    record.write_text(record.read_text().replace('"rows": ', '"rows": 1'))
-    for path in (chunk, table, copy / "truth" / "stars" / "catalog" / "hats.properties"):
-        path.unlink()
-    done = command("verify", str(copy), "--forget")
-    assert done.returncode == 1
-    for stage in ("coadds/rubin", "objects/roman", "detections/roman", "truth/stars"):
-        assert f"damaged: {stage}/" in done.stdout
-    again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert int(again.stdout.split("made ")[1].split(" ")[0]) <= 8
-    assert command("verify", str(copy)).returncode == 0
-    after = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+DAMAGES = (truncate, empty, flip, Path.unlink)
+KINDS = {
+    "shards": ["coadds/roman.zarr/*/c/*/0/0/0"] * 4,
+    "tables beside images": ["coadds/roman_sets/*.parquet"] * 3,
+    "partitions": ["objects/rubin/catalog/**/Npix*.parquet", *["truth_match/rubin/*.parquet"] * 3],
+    "tables": [
+        f"{name}/all.parquet" for name in ("pointings/rubin", "limits/roman", "shear/roman", "zero_points/rubin")
+    ],
+    "records": [*["manifest/detections/rubin/*.json"] * 3, "manifest/statistics/blends/*.json"],
+    "metadata of arrays": [f"coadds/rubin.zarr/{name}/zarr.json" for name in ("dq", "image", "noise", "weight")],
+    "metadata of groups": [f"{name}.zarr/zarr.json" for name in ("coadds/rubin", "truth/structure", "truth/seds")],
+    "coordinates": [f"coadds/rubin.zarr/{name}/c/0" for name in ("band", "dec", "header", "ra")],
+    "catalogs": [
+        "truth/galaxies/catalog/hats.properties",
+        "objects/roman/catalog/partition_info.csv",
+        "matches/groups/catalog/dataset/_metadata",
+        "objects/rubin/catalog/properties",
+    ],
+    "collections": [
+        f"{name}/collection.properties"
+        for name in ("truth/galaxies", "objects/roman", "samples/roman", "matches/groups")
+    ],
+    "checksums": [
+        f"manifest/{name}/files.seal" for name in ("samples/roman", "samples/rubin", "truth/stars", "objects/rubin")
+    ],
+    "spectra": [f"truth/seds.zarr/{name}" for name in ("wave/c/0", "sed/c/0", "photons/c/0/0", "wave/zarr.json")],
+}
+"""Patterns of files, each damaged in another way: the first that matches, and is not damaged yet."""
+NO_DAMAGE = {"manifest/statistics/blends/all.json", "manifest/objects/rubin/files.seal"}
+"""What is removed here without being damage (see above)."""
+
+
+def run_again(folder: Path) -> str:
+    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def assert_same_bytes(store: Path, before: dict[Path, bytes]) -> None:
+    after = {path.relative_to(store): path.read_bytes() for path in stored(store)}
     assert set(after) == set(before)
     # records and catalog properties hold times, and the settings hold the working directory
-    skipped = {"manifest", "versions.json", "pipeline.yaml"}
+    skipped = {"manifest", "pipeline.yaml"}
     for name, content in before.items():
         if name.parts[0] not in skipped and name.name != "hats.properties":
             assert after[name] == content, name
     for name in (name for name in before if name.suffix == ".json" and name.parts[0] == "manifest"):
-        assert json.loads(after[name])["output"] == json.loads(before[name])["output"]
+        assert json.loads(after[name])["output"] == json.loads(before[name])["output"], name
+    assert command("verify", str(store)).returncode == 0
+
+
+def test_files_of_every_kind_are_made_again_with_the_same_bytes(store, tmp_path):
+    copy = tmp_path / "s"
+    shutil.copytree(store, copy)
+    before = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
+    harmed: set[str] = set()
+    for patterns in KINDS.values():
+        for harm, pattern in zip(DAMAGES, patterns, strict=False):
+            files = (path for path in sorted(copy.glob(pattern)) if path.is_file())
+            path = next(path for path in files if str(path.relative_to(copy)) not in harmed)
+            harm(path)
+            harmed.add(str(path.relative_to(copy)))
+    found = command("verify", str(copy))
+    assert found.returncode == 1, found.stderr
+    assert "damaged: coadds/rubin/*: cannot be verified before" in found.stdout
+    forgotten = command("verify", str(copy), "--forget")
+    assert forgotten.returncode == 1, forgotten.stderr
+    reported = {line.split(": ")[1] for line in forgotten.stdout.splitlines() if line.startswith("damaged: ")}
+    for name in harmed - NO_DAMAGE:
+        stage, path = stage_of(copy, copy / name), copy / name
+        own = {text.removeprefix(f"{stage}/") for text in reported if text.startswith(f"{stage}/")}
+        assert own & {path.stem, name, path.name, "*"} or own and path.suffix != ".json", name
+    # the settings are written by every run, and read by all commands but this one
+    truncate(copy / "pipeline.yaml")
+    made = int(run_again(tmp_path).split("made ")[1].split(" ")[0])
+    assert made <= 30, "what is intact is kept"
+    assert_same_bytes(copy, before)
+
+
+def test_units_that_have_read_damaged_data_are_made_when_it_is_forgotten(store, tmp_path):
+    """They fail, and data made again has the hash with which they have failed."""
+    copy = tmp_path / "s"
+    shutil.copytree(store, copy)
+    before = {path.relative_to(copy): path.read_bytes() for path in stored(copy)}
+    truncate(
+        next(path for path in sorted((copy / "coadds" / "roman.zarr" / "image" / "c").rglob("*")) if path.is_file())
+    )
+    for record in (copy / "manifest" / "detections" / "roman").glob("*.json"):
+        record.unlink()
+    failing = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    assert failing.returncode == 1
+    assert [*(copy / "manifest" / "detections" / "roman").glob("*.failed")]
+    assert command("verify", str(copy), "--forget").returncode == 1
+    run_again(tmp_path)
+    assert_same_bytes(copy, before)
+
+
+@pytest.mark.parametrize("harm", [empty, Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:12])])
+def test_a_unit_with_a_damaged_failure_is_tried_again(harm, tmp_path):
+    product = TableProduct(
+        stage="t/x", units=(Unit("u", 0),), make=lambda k: None, schema=pa.schema([pa.field("a", pa.int64())])
+    )
+    store = Store(tmp_path)
+    task = find_stale(product, StoredOutputs(store)).tasks["u"]
+    write_failure(store, "t/x", "u", digest("t/x", task.parts), "reason")
+    assert find_stale(product, StoredOutputs(store)).failed == ["u"]
+    harm(store.records("t/x") / "u.failed")
+    assert "u" in find_stale(product, StoredOutputs(store)).tasks
 
 
 def test_a_store_that_cannot_be_written_is_refused_with_one_line(tmp_path):

@@ -1,6 +1,7 @@
 """Commands of `romandask export`: their names and options, and that a new module is all that a new format needs."""
 
 import importlib
+import re
 import sys
 
 import pytest
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 import romandask.export
 from romandask.cli.export import make_export_app
 from romandask.export import sha256sums
-from romandask.export.command import collect_commands, export_command
+from romandask.export.command import declared_commands
 
 COMMANDS = {
     "asdf": ["STORE", "OUT", "--exposure", "--tile", "--band"],
@@ -79,8 +80,18 @@ def test_a_new_format_is_one_new_module(made_up_format, tmp_path):
     assert dict(sha256sums.check(tmp_path)) == {"tiles.txt": ""}
 
 
-def test_a_name_is_declared_once(made_up_format, monkeypatch):
-    module = importlib.import_module("romandask.export.made_up")
-    monkeypatch.setattr(module, "again", export_command("truth")(module.command.function), raising=False)
-    with pytest.raises(ValueError, match="'truth' is declared twice"):
-        collect_commands(romandask.export)
+def test_a_name_is_declared_once(made_up_format, tmp_path):
+    (tmp_path / "modules" / "other.py").write_text(MADE_UP_FORMAT)
+    with pytest.raises(ValueError, match="'made-up' is declared twice"):
+        declared_commands(romandask.export)
+
+
+def test_help_and_completion_list_the_commands_with_their_help():
+    app = make_export_app()
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
+    for name, command in get_command(app).commands.items():
+        assert re.search(rf"{name} +{re.escape(command.help)}", shown), name
+    assert "--help" in shown
+    environment = {"_ROMANDASK_COMPLETE": "complete_bash", "COMP_WORDS": "romandask o", "COMP_CWORD": "1"}
+    done = CliRunner().invoke(app, [], prog_name="romandask", env=environment)
+    assert done.output.split() == ["obscore", "obseq"]

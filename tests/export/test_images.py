@@ -107,7 +107,7 @@ def test_tiles_are_valid_level_3_mosaics(survey, tmp_path):
     (path,) = export_asdf(survey, tmp_path, [], [tile.name], ["H158"])
     coadd = survey.coadds("roman").sel(band="H158").isel(tile=0).compute()
     product = survey.output("coadds/roman")
-    sets = product.load(product.names.index(f"{tile.name}-H158"), ("sets",))["sets"]
+    sets = product.load(product.index(0, "H158", 0, 0), ("sets",))["sets"]
     with rdm.open(path) as model:
         assert isinstance(model, rdm.datamodels.MosaicModel)
         model.validate()
@@ -155,9 +155,9 @@ def test_the_obscore_table_describes_all_images(survey, tmp_path):
     roman, rubin = survey.output("coadds/roman"), survey.output("coadds/rubin")
     exposures = survey.output("exposures/roman")
     count = export_obscore(survey, tmp_path / "images.vot")
-    assert count == len(exposures.names) + len(roman.names) + len(rubin.names)
+    assert count == len(exposures.names) + len(roman.image_names) + len(rubin.image_names)
     table = Table.read(tmp_path / "images.vot", format="votable")
-    assert set(table["obs_id"]) == {*exposures.names, *roman.names, *rubin.names}
+    assert set(table["obs_id"]) == {*exposures.names, *roman.image_names, *rubin.image_names}
     assert len(set(table["obs_publisher_did"])) == count
     one = table[table["obs_id"] == exposures.names[0]][0]
     row = survey.pointings("roman").iloc[0]

@@ -16,7 +16,8 @@ from romandask.kernels.detectors.simple_detector import NO_DATA
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs
 from romandask.stages.coadds.coadds import coadds
-from romandask.stages.cutouts import Positions, cutouts, located
+from romandask.stages.cutouts import cutouts
+from romandask.stages.wanted import Positions, located
 
 SIZE = 32
 LAYERS = ("image", "truth", "dq", "background", "weight", "psf")
@@ -148,7 +149,7 @@ def test_cutouts_of_coadds_are_pixels_of_the_tiles(small, objects):
         x, y = WCS(tile.header(260, 0.0575)).all_world2pix(float(one["ra"]), float(one["dec"]), 0)
         np.testing.assert_allclose([one["x_image"], one["y_image"]], [x, y], atol=1e-6)
     one = lazy.isel(cutout=slice(0, 1)).compute()
-    k = product.names.index(str(one["unit"][0].to_numpy()))
+    k = product.image_names.index(str(one["unit"][0].to_numpy()))
     row, column = int(one["row"][0]), int(one["column"][0])
     low, left = max(row, 0), max(column, 0)
     whole = product.load(k)["image"][low : row + SIZE, left : column + SIZE]

@@ -21,12 +21,14 @@ import romandask
 from romandask.engine.event_log import Log, events, newest_event, runs
 from romandask.ingest import instance_catalog, obseq, opsim
 from romandask.model.errors import UserError
+from romandask.storage import lock
 from romandask.storage.lock import in_use, locked
 from romandask.storage.manifest import read_records
 from romandask.storage.paths import (
     file_state,
     files_below,
     local_copy,
+    modification_time,
     parse_path,
     read_files,
     remove_folder,
@@ -135,13 +137,44 @@ def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(folder):
     with locked(folder):
         assert in_use(folder)
         holder = json.loads((folder / ".lock").read_bytes())
-        (folder / ".lock").write_text(json.dumps(holder | {"pid": os.getppid()}))
         with pytest.raises(UserError, match="in use by another driver"), locked(folder):
             pass
-        (folder / ".lock").write_text(json.dumps(holder | {"pid": 2**22 + 1}))
+        (folder / ".lock").write_text(json.dumps(holder | {"started": 1, "id": "before"}))
         with locked(folder):
             assert in_use(folder)
     assert not in_use(folder)
+
+
+def test_a_lock_in_a_bucket_is_renewed_and_lost_to_a_driver_elsewhere(folder, monkeypatch):
+    monkeypatch.setattr(lock, "RENEW_INTERVAL", 0.5)
+    path = folder / ".lock"
+    with locked(folder) as own:
+        written = modification_time(path)
+        until(lambda: modification_time(path) > written)
+        own.check()
+        path.write_text(json.dumps({"host": "elsewhere", "machine": "b", "pid": 7, "id": "x"}))
+        until(lambda: own._lost_to)
+        with pytest.raises(UserError, match=r"a driver on elsewhere \(process 7\) has taken the store"):
+            own.check()
+    assert json.loads(path.read_bytes())["id"] == "x", "a lock of another driver stays"
+    with pytest.raises(UserError, match=r"in use by a driver on elsewhere .* takes over in \d+ s"), locked(folder):
+        pass
+    monkeypatch.setattr(lock, "LEASE", 1.0)
+    time.sleep(2.1)
+    lines = []
+    with locked(folder, lines.append):
+        assert in_use(folder)
+    assert len(lines) == 1
+    assert "taking over from a driver on elsewhere (process 7)" in lines[0]
+    assert files_below(folder) == []
+
+
+def until(condition) -> None:
+    for _ in range(100):
+        if condition():
+            return
+        time.sleep(0.1)
+    raise AssertionError("not in ten seconds")
 
 
 def test_a_log_is_uploaded_in_parts(folder):

@@ -1,6 +1,5 @@
-"""Products, records and locks of a store: what is written is read back, and damage is detected."""
+"""Products and records of a store: what is written is read back, and damage is detected."""
 
-import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from romandask.products.images import ImageProduct
 from romandask.products.tables import TableProduct, conform
 from romandask.products.units import LazyUnits, Unit, names_of
 from romandask.storage.arrays import Variable
-from romandask.storage.lock import locked
 from romandask.storage.manifest import Record, digest, read_record, write_record
 from romandask.storage.paths import write_bytes
 from romandask.storage.store import Store, read_parquet, write_parquet
@@ -43,6 +41,40 @@ def image_product(count: int) -> ImageProduct:
         lengths=(count,),
         coordinates=lambda: coordinates,
     )
+
+
+TORN = (
+    Variable("shards", "float32", (5000, 8), ("y", "x"), {}),
+    Variable("planes", "int16", (2, 64, 48), ("plane", "y", "x"), {}),
+    Variable("files", "float32", (1100, 8), ("y", "x"), {}, compress=False),
+)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content), None],
+    ids=["truncated", "empty", "changed", "gone"],
+)
+def test_a_damaged_unit_is_written_again(tmp_path, damage):
+    """Zarr reads a shard before it writes it, and would fail."""
+    product = replace(
+        image_product(2),
+        make=lambda k: {v.name: np.random.default_rng(k).normal(size=v.shape) * 99 for v in TORN},
+        variables=TORN,
+    )
+    store, root = Store(tmp_path), tmp_path / "exposures" / "x.zarr"
+    product.prepare(store)
+    written = [product.write(index, store) for index in range(2)]
+    before = {path: path.read_bytes() for path in sorted(root.glob("*/c/**/*")) if path.is_file()}
+    own = [path for path in before if path.relative_to(root).parts[2] == "1" and path.parts[-3] != "exposure"]
+    assert len(own) == 2 + 1 + 2, "two shards, one of both planes, two files without shards"
+    for path in own:
+        path.unlink() if damage is None else path.write_bytes(damage(before[path]))
+        with pytest.raises(UserError, match="is damaged"):
+            product.stored(store).reader(1)(path.relative_to(root).parts[0])
+    assert product.write(1, store) == written[1]
+    assert {path: path.read_bytes() for path in before} == before
+    assert product.verify(1, store) == written[1].output
 
 
 def test_images_are_read_back_and_arrays_grow_with_the_number_of_units(tmp_path):
@@ -169,21 +201,6 @@ def test_the_lazy_table_has_the_rows_of_all_units(tmp_path):
         stage="t", units=(Unit("0", 0), Unit("1", 1)), make=lambda k: pd.DataFrame({"a": [k, k + 10]}), schema=schema
     )
     assert product.frame.compute(scheduler="synchronous")["a"].tolist() == [0, 10, 1, 11]
-
-
-def test_a_second_driver_is_refused_and_a_stale_lock_taken_over(tmp_path):
-    with locked(tmp_path):
-        holder = json.loads((tmp_path / ".lock").read_text())
-        (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 1}))
-        with pytest.raises(UserError, match="another driver"), locked(tmp_path):
-            pass
-    (tmp_path / ".lock").write_text(json.dumps(holder | {"pid": 2**22 + 1}))
-    with locked(tmp_path):
-        assert (tmp_path / ".lock").exists()
-    assert not (tmp_path / ".lock").exists()
-    (tmp_path / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
-    with pytest.raises(UserError, match="elsewhere"), locked(tmp_path):
-        pass
 
 
 def test_a_store_that_cannot_be_written_is_refused(tmp_path):

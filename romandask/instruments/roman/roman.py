@@ -232,7 +232,8 @@ class Roman:
             date=_date(exposure.mjd),
             exptime=exposure.exptime,
         )
-        level *= 1 + galsim.roman.stray_light_fraction
+        # a Python number, so that the product with float32 areas stays float32
+        level = float(level) * (1 + galsim.roman.stray_light_fraction)
         dark = galsim.roman.dark_current if self.calibration is None else 0.0
         flat = galsim.roman.thermal_backgrounds[exposure.band] + dark
         return (pixel_areas(header, self.shape, rows, columns) * level + flat * exposure.exptime).astype(np.float32)

@@ -36,11 +36,14 @@ class Sums:
         Number of planes of each exposure.
     pixfrac : float
         Side of a drop over the side of a native pixel.
+    corner : (int, int)
+        Row and column on the tile of the first pixel of the sums, if these are a window of the tile: a pixel has the
+        same sums, to the last bit, whatever the window is.
     """
 
-    def __init__(self, shape: tuple[int, int], planes: int, pixfrac: float):
+    def __init__(self, shape: tuple[int, int], planes: int, pixfrac: float, corner: tuple[int, int] = (0, 0)):
         self._sums = tuple(np.zeros(shape, np.float32) for _ in range(planes))
-        self._pixfrac = pixfrac
+        self._pixfrac, self._corner = pixfrac, corner
         self._set_links: list[tuple[int, int]] = [(0, -1)]  # of each set: parent set, exposure added to it
         self._exposure_count = 0
         self.weight = np.zeros(shape, np.float32)
@@ -54,8 +57,9 @@ class Sums:
         Parameters
         ----------
         parts : iterable of (images, weight, map)
-            One entry for each strip of the exposure: its planes in surface brightness, each (ny, nx); its weight
-            (ny, nx), 0 for bad pixels; the map of its pixels onto the tile.
+            One entry for each strip of the exposure: its planes, each (ny, nx), in light per native pixel; its weight
+            (ny, nx), 0 for bad pixels; the map of its pixels onto the tile. The means are in light per tile pixel: the
+            light of a native pixel is divided by its area on the tile.
 
         Raises
         ------
@@ -74,9 +78,11 @@ class Sums:
                 np.ascontiguousarray(weight, np.float32),
                 pixel_map.curves(rows - half),
                 pixel_map.curves(rows + half),
-                pixel_map.x,
+                pixel_map.x[pixel_map.pieces.start : pixel_map.pieces.stop + 1],
                 pixel_map.columns.start,
                 half,
+                self._corner[0],
+                self._corner[1],
                 self._sums,
                 self.weight,
                 self.set,
@@ -113,7 +119,23 @@ class Sums:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, total, sets, successor, parents, new_sets):
+def _drizzle(
+    images,
+    weight,
+    lower,
+    upper,
+    knots,
+    first_column,
+    half,
+    first_y,
+    first_x,
+    sums,
+    total,
+    sets,
+    successor,
+    parents,
+    new_sets,
+):
     """Add a strip of an exposure to the sums; return the number of new sets, -1 if there are too many.
 
     Parameters
@@ -126,6 +148,8 @@ def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, tota
         Columns of the exposure at which the cubics join, and the first column of the strip.
     half : float
         Half the side of a drop, native pixels.
+    first_y, first_x : int
+        Row and column on the tile of the first pixel of the sums.
     sums, total, sets : tuple of (height, width), and (height, width)
         Sums of the planes, sum of the weights and number of the set of each tile pixel. They are updated.
     successor : (old sets,)
@@ -138,13 +162,15 @@ def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, tota
     step = knots[1] - knots[0]
     extent = _max_extent(lower, upper, step)
     cells = np.zeros((extent, extent + 2))
+    values = np.empty(len(images), np.float32)
+    top_limit, right_limit = first_y + height, first_x + width
     # pieces of rows in the outer loop: neighbouring rows then fall on the same tile pixels while these are in cache
     for piece in range(len(knots) - 1):
         begin = max(int(np.ceil(knots[piece])) - first_column, 0)
         end = nx if piece == len(knots) - 2 else min(int(np.ceil(knots[piece + 1])) - first_column, nx)
         for row in range(ny):
             low, high = lower[row, :, piece], upper[row, :, piece]
-            if _is_outside(low, high, step, extent, height, width):
+            if _is_outside(low, step, extent, first_y, first_x, height, width):
                 continue
             for column in range(begin, end):
                 w = weight[row, column]
@@ -158,14 +184,19 @@ def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, tota
                 dx, dy = _cubic(high[0], near) + 0.5, _cubic(high[1], near) + 0.5
                 left, right = np.floor(min(ax, bx, cx, dx)), np.floor(max(ax, bx, cx, dx))
                 bottom, top = np.floor(min(ay, by, cy, dy)), np.floor(max(ay, by, cy, dy))
-                if right < 0 or left >= width or top < 0 or bottom >= height:
+                if right < first_x or left >= right_limit or top < first_y or bottom >= top_limit:
                     continue
-                weight_per_area = np.float32(w / abs(0.5 * ((cx - ax) * (dy - by) - (dx - bx) * (cy - ay))))
+                area = abs(0.5 * ((cx - ax) * (dy - by) - (dx - bx) * (cy - ay)))
+                weight_per_area = np.float32(w / area)
+                # a drop has the shape of its pixel, 2 * half as wide
+                per_area = np.float32(4 * half * half / area)
+                for plane in range(len(images)):
+                    values[plane] = images[plane][row, column] * per_area
                 _add_edge(cells, ax - left, ay - bottom, bx - left, by - bottom)
                 _add_edge(cells, bx - left, by - bottom, cx - left, cy - bottom)
                 _add_edge(cells, cx - left, cy - bottom, dx - left, dy - bottom)
                 _add_edge(cells, dx - left, dy - bottom, ax - left, ay - bottom)
-                x0, y0, columns = int(left), int(bottom), int(right - left) + 1
+                x0, y0, columns = int(left) - first_x, int(bottom) - first_y, int(right - left) + 1
                 for j in range(int(top - bottom) + 1):
                     covered = 0.0
                     y = y0 + j
@@ -179,7 +210,7 @@ def _drizzle(images, weight, lower, upper, knots, first_column, half, sums, tota
                         pixel_weight = weight_per_area * np.float32(share)
                         total[y, x] += pixel_weight
                         for plane in range(len(images)):
-                            sums[plane][y, x] += pixel_weight * images[plane][row, column]
+                            sums[plane][y, x] += pixel_weight * values[plane]
                         old = sets[y, x]
                         if old < len(successor):
                             if successor[old] < 0:
@@ -213,11 +244,11 @@ def _max_extent(lower, upper, step):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _is_outside(low, high, step, margin, height, width):
-    """Return whether a piece of a row lies outside the tile; the piece is nearly straight."""
+def _is_outside(low, step, margin, first_y, first_x, height, width):
+    """Return whether a piece of a row lies outside the sums; the piece is nearly straight."""
     for axis in range(2):
-        length = width if axis == 0 else height
-        a, b = _cubic(low[axis], 0.0), _cubic(low[axis], step)
+        start, length = (first_x, width) if axis == 0 else (first_y, height)
+        a, b = _cubic(low[axis], 0.0) - start, _cubic(low[axis], step) - start
         if max(a, b) < -margin or min(a, b) > length + margin:
             return True
     return False

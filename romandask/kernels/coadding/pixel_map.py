@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from astropy.wcs import WCS
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PPoly
 
 GRID_STEP = 64
 """Distance between the grid points at which the map between two WCSs is computed exactly, pixels."""
 STRIP_ROWS = 512
-"""Approximate number of rows of a strip."""
+"""Number of rows of a strip. Strips begin at multiples of it, wherever the part of the source begins."""
 MARGIN = 4
-"""Margin around the part of an exposure that falls on a tile, pixels."""
+"""Margin around a window of a target, target pixels; it covers the curvature of the map between two knots."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,29 @@ class PixelMap:
         """Rows and columns of the part."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
 
+    def part(self, rows: slice, columns: slice) -> PixelMap:
+        """Return the same map for a part of its pixels: the same positions, to the last bit."""
+        part = replace(self, rows=rows, columns=columns)
+        # the splines are those of the whole map
+        part.__dict__["_splines"] = self._splines
+        return part
+
+    @cached_property
+    def _splines(self) -> CubicSpline:
+        """Splines along y of the coefficients of splines along x, of shape (powers, pieces, 2)."""
+        return CubicSpline(self.y, np.moveaxis(CubicSpline(self.x, self.positions, axis=2).c, 3, 0), axis=0)
+
+    @property
+    def pieces(self) -> slice:
+        """Intervals between two knots that the columns of the part lie in."""
+        first = int(np.searchsorted(self.x, self.columns.start, "right")) - 1
+        last = int(np.searchsorted(self.x, self.columns.stop - 1, "right"))
+        return slice(max(first, 0), max(min(last, len(self.x) - 1), first + 1, 1))
+
     def curves(self, rows: np.ndarray) -> np.ndarray:
         """Return cubic polynomials, along some source rows, of the positions on the target.
+
+        The polynomials of a row do not depend on which other rows and columns are requested.
 
         Parameters
         ----------
@@ -60,18 +82,19 @@ class PixelMap:
 
         Returns
         -------
-        ndarray, shape (k, 2, n - 1, 4)
-            Coefficients for each row, for x and y, and for each interval between two knots. The highest power comes
-            first; the variable is the distance from the first knot of the interval, in columns.
+        ndarray, shape (k, 2, pieces, 4)
+            Coefficients for each row, for x and y, and for each interval of `pieces`. The highest power comes first;
+            the variable is the distance from the first knot of the interval, in columns.
         """
-        along = CubicSpline(self.y, self.positions, axis=1)(rows)
-        return np.ascontiguousarray(np.moveaxis(CubicSpline(self.x, along, axis=2).c, (0, 1, 2, 3), (3, 2, 1, 0)))
+        splines = PPoly.construct_fast(self._splines.c[:, :, :, self.pieces], self.y)
+        return np.ascontiguousarray(np.transpose(splines(rows), (0, 3, 2, 1)))
 
     def at(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the positions on the target, (k, 2), of the source pixels at some rows and columns, (k,)."""
         unique, row = np.unique(rows, return_inverse=True)
-        piece = np.clip(np.searchsorted(self.x, columns, "right") - 1, 0, len(self.x) - 2)
-        curve = self.curves(unique)[row, :, piece]
+        first, stop = self.pieces.start, self.pieces.stop
+        piece = np.clip(np.searchsorted(self.x, columns, "right") - 1, first, stop - 1)
+        curve = self.curves(unique)[row, :, piece - first]
         step = (columns - self.x[piece])[:, None]
         return ((curve[..., 0] * step + curve[..., 1]) * step + curve[..., 2]) * step + curve[..., 3]
 
@@ -82,41 +105,52 @@ class PixelMap:
         return np.moveaxis(CubicSpline(self.x, along, axis=2)(columns), 0, -1)
 
 
-def strips(source: WCS, shape: tuple[int, int], target: WCS, target_shape: tuple[int, int]) -> list[Strip]:
-    """Return the part of a source image that may fall on a target image, divided into strips of rows.
+def strips(onto: PixelMap, window: tuple[slice, slice]) -> list[Strip]:
+    """Return the part of a source image that may fall on a window of a target image, divided into strips of rows.
 
-    Strips limit the memory of what is computed for each pixel.
+    Strips limit the memory of what is computed for each pixel. They begin at multiples of STRIP_ROWS, so that pixels
+    are visited in the same order whatever the window is, and each has the columns that may fall on the window.
 
     Parameters
     ----------
-    source, target : WCS
-    shape, target_shape : tuple of int
-        Rows and columns of the source and of the target.
+    onto : PixelMap
+        Map of the source onto the target.
+    window : (slice, slice)
+        Rows and columns of the target.
 
     Returns
     -------
     list of Strip
-        Empty if no pixel of the source falls on the target.
+        Empty if no pixel of the source falls on the window.
     """
-    ys, xs = (np.unique(np.r_[np.arange(0, n - 1, GRID_STEP), n - 1]) for n in shape)
-    x, y = _transform(source, target, *np.meshgrid(xs, ys))
-    ny, nx = target_shape
-    on = (x > -MARGIN) & (x < nx + MARGIN) & (y > -MARGIN) & (y < ny + MARGIN)
-    # a target smaller than the grid step may lie between grid points: map its own area back onto the source too
-    edge = np.linspace(-0.5, 1, 9)
-    back = _transform(target, source, *(axis.ravel() for axis in np.meshgrid(edge * nx, edge * ny)))
-    inside = (back[0] > -0.5) & (back[0] < shape[1] - 0.5) & (back[1] > -0.5) & (back[1] < shape[0] - 0.5)
-    if not on.any() and not inside.any():
-        return []
-    u = np.concatenate([np.broadcast_to(xs, on.shape)[on], back[0][inside]])
-    v = np.concatenate([np.broadcast_to(ys[:, None], on.shape)[on], back[1][inside]])
-    columns, rows = _bounds(u, shape[1]), _bounds(v, shape[0])
-    edges = (
-        np.linspace(rows.start, rows.stop, max(1, round((rows.stop - rows.start) / STRIP_ROWS)) + 1)
-        .astype(int)
-        .tolist()
+    m, n = onto.positions.shape[1:]
+    corners = np.stack([onto.positions[:, i : m - 1 + i, k : n - 1 + k] for i in (0, 1) for k in (0, 1)])
+    low, high = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
+    rows, columns = window
+    on = (high[0] > columns.start) & (low[0] < columns.stop) & (high[1] > rows.start) & (low[1] < rows.stop)
+    found = []
+    for first in range(onto.rows.start // STRIP_ROWS * STRIP_ROWS, onto.rows.stop, STRIP_ROWS):
+        own = on & (onto.y[1:, None] >= first) & (onto.y[:-1, None] <= first + STRIP_ROWS)
+        across, along = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
+        if len(across):
+            inside = _between(onto.y, across, max(first, onto.rows.start), min(first + STRIP_ROWS, onto.rows.stop))
+            part = _between(onto.x, along, onto.columns.start, onto.columns.stop)
+            if inside.start < inside.stop and part.start < part.stop:
+                found.append(Strip(inside, part))
+    return found
+
+
+def bounds(parts: Sequence[Strip]) -> tuple[slice, slice]:
+    """Return the rows and columns that some strips lie in."""
+    return (
+        slice(parts[0].rows.start, parts[-1].rows.stop),
+        slice(min(part.columns.start for part in parts), max(part.columns.stop for part in parts)),
     )
-    return [Strip(slice(low, high), columns) for low, high in itertools.pairwise(edges)]
+
+
+def _between(knots: np.ndarray, pieces: np.ndarray, start: int, stop: int) -> slice:
+    """Return the pixels from `start` to `stop` that lie in some intervals between knots, and those next to them."""
+    return slice(max(int(np.floor(knots[pieces[0]])) - 1, start), min(int(np.ceil(knots[pieces[-1] + 1])) + 2, stop))
 
 
 def pixel_map(source: WCS, target: WCS, rows: slice, columns: slice) -> PixelMap:
@@ -131,12 +165,6 @@ def _transform(source: WCS, target: WCS, x: np.ndarray, y: np.ndarray) -> tuple[
     ra, dec = source.all_pix2world(x.ravel(), y.ravel(), 0)
     tx, ty = target.all_world2pix(ra, dec, 0, quiet=True)
     return tx.reshape(shape), ty.reshape(shape)
-
-
-def _bounds(values: np.ndarray, length: int) -> slice:
-    """Return the range of some pixel positions, widened by a grid step and the margin, within 0 to `length`."""
-    low, high = np.nanmin(values), np.nanmax(values)
-    return slice(max(0, int(low) - GRID_STEP - MARGIN), min(length, int(high) + GRID_STEP + MARGIN + 1))
 
 
 def _knots(pixels: slice) -> np.ndarray:

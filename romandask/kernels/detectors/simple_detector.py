@@ -91,46 +91,6 @@ def observe(
     return image, dq
 
 
-NOISE_ROWS = 256
-"""Rows of a noise realisation that share one random generator: a part of an image is drawn without the rest."""
-
-
 def usable(dq: np.ndarray) -> np.ndarray:
     """Return a mask of the pixels that may be measured, from a dq plane."""
     return dq & ~np.array(INFORMATIONAL_FLAGS, dq.dtype) == 0
-
-
-def noise_realisation(
-    variance: np.ndarray,
-    width: int,
-    rows: slice,
-    columns: slice,
-    generator: Callable[[int], np.random.Generator],
-) -> np.ndarray:
-    """Draw Gaussian noise of zero mean and given variance for a part of a detector.
-
-    The value of a pixel does not depend on which part of the detector is requested.
-
-    Parameters
-    ----------
-    variance : ndarray, shape (rows, columns), electrons^2
-        Variance of the requested pixels.
-    width : int
-        Columns of the whole detector.
-    rows, columns : slice
-        The requested part of the detector.
-    generator : callable
-        Returns the random generator of a block of NOISE_ROWS rows, given the number of the block.
-
-    Returns
-    -------
-    ndarray, shape (rows, columns), float32, electrons
-    """
-    noise = np.empty(variance.shape, np.float32)
-    for block in range(rows.start // NOISE_ROWS, -(-rows.stop // NOISE_ROWS)):
-        first, last = max(rows.start, block * NOISE_ROWS), min(rows.stop, (block + 1) * NOISE_ROWS)
-        drawn = generator(block).standard_normal((NOISE_ROWS, width), dtype=np.float32)
-        noise[first - rows.start : last - rows.start] = drawn[
-            first - block * NOISE_ROWS : last - block * NOISE_ROWS, columns
-        ]
-    return noise * np.sqrt(variance)

@@ -57,7 +57,8 @@ def differences(
 
     def unit(k: int) -> Unit:
         tile = coadds.tiles[k].name
-        images = (templates.stage, f"{tile}-{settings.template}"), (coadds.stage, f"{tile}-{settings.science}")
+        bands = (templates, settings.template), (coadds, settings.science)
+        images = ((each.stage, each.names[n]) for each, band in bands for n in each.units_of(k, band))
         return Unit(tile, settings.model_dump(), (*images, (detections.stage, tile)))
 
     long_names = {

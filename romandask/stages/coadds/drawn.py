@@ -1,4 +1,4 @@
-"""Tiles of a coadd that are drawn from a cadence: the expected image with the mean PSF, and the noise of the stack."""
+"""Patches of a coadd that are drawn from a cadence: the expected image, with the mean PSF, and the stack's noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from romandask.stages.pointings import corners_of
 
 @dataclass(frozen=True)
 class DrawTile(TileMaker):
-    """Makes a tile in one band from the cadence, without rendering exposures.
+    """Makes a patch of a tile in one band from the cadence, without rendering exposures.
 
     The expected image is drawn once, with the weighted mean PSF of the exposures, and the noise is that of their stack.
     """
@@ -33,8 +33,8 @@ class DrawTile(TileMaker):
         """Return image, weight, noise, nimages, dq and psf of a unit."""
         renderer, unit = self.exposures.renderer, self.unit(index)
         instrument = renderer.instrument
-        tile, band, wcs = unit.tile, unit.band, unit.wcs
-        shape = (self.pixels, self.pixels)
+        tile, band, wcs, shape = unit.tile, unit.band, unit.wcs, unit.shape
+        identity = (instrument.name, tile.id, band, unit.row, unit.column)
         bandpass = instrument.bandpass(band)
         rows = renderer.table.iloc[unit.members]
         exposures = [exposure_of(row) for _, row in rows.iterrows()]
@@ -50,7 +50,7 @@ class DrawTile(TileMaker):
             side = psf_side(instrument)
             blank = np.zeros((realisations, *shape), np.float32)
             return {**planes, "image": blank[0], "noise": blank, "psf": np.zeros((side, side))}
-        truth = renderer.truth.near(*cone(tile.corners(self.settings.grid().side)))
+        truth = renderer.truth.near(*cone(unit.footprint))
         scene = build_scene(truth, wcs, bandpass, to_njy, instrument.knot_smoothing).scene
         faintest = self.render.truncation / np.sqrt(layers.weight.max())
         psf = instrument.effective_psf(exposures, layers.shares)
@@ -58,10 +58,10 @@ class DrawTile(TileMaker):
         covered = layers.weight > 0
         expected = np.where(covered, draw(scene, psf, shape, stamps, faintest), 0)
         empty_variance = np.where(covered, 1 / np.maximum(layers.weight, np.finfo(np.float32).tiny), 0)
-        normal = rng(self.seed, "coadds", instrument.name, tile.id, band).standard_normal(shape, dtype=np.float32)
+        normal = rng(self.seed, "coadds", *identity).standard_normal(shape, dtype=np.float32)
         noise = np.empty((realisations, *shape), np.float32)
         for number, plane in enumerate(noise):
-            generator = rng(self.seed, "coadds", "noise", instrument.name, tile.id, band, *realisation_key(number))
+            generator = rng(self.seed, "coadds", "noise", *identity, *realisation_key(number))
             generator.standard_normal(out=plane, dtype=np.float32)
             plane *= np.sqrt(empty_variance)
         image = expected + normal * np.sqrt(empty_variance + layers.source * np.maximum(expected, 0))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.instrument import Instrument
-from romandask.kernels.detectors.simple_detector import noise_realisation
+from romandask.kernels.detectors.pixel_noise import pixel_noise
 from romandask.model.seeds import realisation_key, rng
 
 
@@ -23,7 +22,7 @@ def noise_realisations(
 ) -> Iterator[np.ndarray]:
     """Yield Gaussian noise realisations of a part of an exposure.
 
-    All tiles that the exposure touches see the same noise.
+    All patches that the exposure touches see the same noise: a pixel has the same noise in every part.
 
     Parameters
     ----------
@@ -44,6 +43,7 @@ def noise_realisations(
     ------
     ndarray, shape (rows, columns), float32, electrons
     """
-    generator = partial(rng, seed, "coadds", "noise", instrument.name, exposure.visit, exposure.detector)
     for number in range(count):
-        yield noise_realisation(variance, instrument.shape[1], *part, partial(generator, *realisation_key(number)))
+        identity = (exposure.visit, exposure.detector, *realisation_key(number))
+        key = rng(seed, "coadds", "noise", instrument.name, *identity).integers(1 << 63, dtype=np.uint64)
+        yield pixel_noise(variance, instrument.shape[1], part[0].start, part[1].start, key)

@@ -48,10 +48,10 @@ def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:
 def input_psf(
     instrument: Instrument, psfs: Psfs, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float
 ) -> np.ndarray:
-    """Return the PSF of one exposure of a drizzled tile: the drizzled image of a star of unit flux and flat f_nu.
+    """Return the PSF of one exposure of a drizzled patch: the drizzled image of a star of unit flux and flat f_nu.
 
     It is the PSF at the centre of the detector (Troxel et al. 2023, section 5.2), with the orientation and distortion
-    of the exposure at the centre of the tile.
+    of the exposure at the centre of the patch.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def input_psf(
     source : WCS
         WCS of the exposure.
     ra, dec : float, degrees
-        Centre of the tile.
+        Centre of the patch.
     pixfrac : float
         Side of a drop over the side of a native pixel.
 
@@ -122,7 +122,7 @@ def star_on(
         half = int(np.ceil(0.75 * stamp / np.sqrt(area))) + 2
         column, row = round(x), round(y)
         fine = psf_image(instrument, exposure, x, y, shares)
-        star = native_star(fine, OVERSAMPLING, half, x - column, y - row) / area
+        star = native_star(fine, OVERSAMPLING, half, x - column, y - row)
         rows, columns = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
         weights = np.full(star.shape, weight, np.float32)
         sums.add([([star], weights, pixel_map(source, target, rows, columns))])

@@ -11,8 +11,10 @@ from romandask.instruments.exposure import exposure_of
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.model.errors import UserError
+from romandask.model.sky import covering_sums
 from romandask.model.tiles import tangent_header
 from romandask.stages.coadds.tile_maker import Coadds
+from romandask.stages.pointings import corners_of
 
 CHOICES = np.round(np.arange(0.3, 1.001, 0.1), 1)
 """Values of pixfrac that are compared."""
@@ -44,8 +46,8 @@ class Coverage:
 def coverage(coadds: Coadds) -> list[Coverage]:
     """Return the coverage of each band with each pixfrac of CHOICES.
 
-    It is measured at the centre of the tile with the most exposures, from the WCSs of the exposures alone: all their
-    pixels are taken to be good.
+    It is measured at the centre of the tile whose centre has the most exposures, from the WCSs of the exposures alone:
+    all their pixels are taken to be good.
 
     Raises
     ------
@@ -56,18 +58,18 @@ def coverage(coadds: Coadds) -> list[Coverage]:
     if coadds.instrument.coadd != "drizzle":
         raise UserError("pixfrac: only Roman's coadds are drizzled, and this pipeline has no Roman")
     instrument, scale = coadds.instrument, coadds.instrument.coadd_scale
-    totals = [sum(len(maker.members[k, band]) for band in instrument.bands) for k in range(len(maker.tiles))]
-    k = int(np.argmax(totals))
+    centres = np.array([(tile.ra, tile.dec) for tile in maker.tiles])
+    k = int(np.argmax(covering_sums(corners_of(table), *centres.T)))
     target = WCS(tangent_header(maker.tiles[k].ra, maker.tiles[k].dec, TEST_SQUARE_PIXELS, scale))
     results = []
     for band in instrument.bands:
         inputs = []
-        for i in maker.members[k, band]:
+        for i in coadds.tile_members(k, band):
             exposure = exposure_of(table.iloc[i])
-            wcs = WCS(instrument.header(exposure))
-            parts = strips(wcs, instrument.shape, target, (TEST_SQUARE_PIXELS, TEST_SQUARE_PIXELS))
+            onto = pixel_map(WCS(instrument.header(exposure)), target, *(slice(0, n) for n in instrument.shape))
+            parts = strips(onto, (slice(0, TEST_SQUARE_PIXELS), slice(0, TEST_SQUARE_PIXELS)))
             if parts:
-                inputs.append((exposure.exptime, [pixel_map(wcs, target, part.rows, part.columns) for part in parts]))
+                inputs.append((exposure.exptime, [onto.part(part.rows, part.columns) for part in parts]))
         if not inputs:
             raise UserError(f"pixfrac: no exposure of {band} on the middle of tile {maker.tiles[k].name}")
         for choice in CHOICES:

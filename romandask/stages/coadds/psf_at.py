@@ -48,8 +48,8 @@ def coadd_psf(
     """Return the image of a star of unit flux at a position on a drizzled coadd.
 
     The PSF is that of the exposures that contribute to the pixel at the position (Troxel et al. 2023, section 5.2). If
-    the tile is stored, these are the exposures of the set of the pixel; otherwise all exposures whose detectors contain
-    the position.
+    the patch is stored, these are the exposures of the set of the pixel; otherwise all exposures whose detectors
+    contain the position.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def coadd_psf(
     maker, instrument = coadds.maker, coadds.instrument
     if instrument.coadd != "drizzle":
         raise UserError(
-            "PSFs at a position exist only for drizzled coadds: a tile of other coadds has one PSF, its array psf"
+            "PSFs at a position exist only for drizzled coadds: a patch of other coadds has one PSF, its array psf"
         )
     if band not in instrument.bands:
         raise UserError(f"band {band!r}: this survey has {', '.join(instrument.bands)}")
@@ -92,10 +92,10 @@ def coadd_psf(
     tiles = [k for k, tile in enumerate(maker.tiles) if tile.id == owner]
     if not tiles:
         raise UserError(f"({ra}, {dec}): outside the tiles of this survey")
-    tile, index = maker.tiles[tiles[0]], coadds.index(tiles[0], band)
+    tile = maker.tiles[tiles[0]]
     header = maker.header(tiles[0])
     target = WCS(header)
-    inputs = _exposures_at(coadds, index, maker.members[tiles[0], band], ra, dec, target)
+    inputs = _exposures_at(coadds, tiles[0], band, ra, dec, target)
     if not inputs:
         raise UserError(f"({ra}, {dec}): no exposure of {band} there")
     stamp = psf_side(instrument) if stamp is None else stamp
@@ -122,27 +122,29 @@ def coadd_psf(
     return xr.DataArray((total / weight).astype(np.float32), dims=("v", "u"), attrs=attributes)
 
 
-def _exposures_at(
-    coadds: Coadds, index: int, members: np.ndarray, ra: float, dec: float, target: WCS
-) -> list[ExposureAt]:
+def _exposures_at(coadds: Coadds, tile: int, band: str, ra: float, dec: float, target: WCS) -> list[ExposureAt]:
     """Return the exposures that contribute at a position on a tile.
 
     Parameters
     ----------
     coadds : Coadds
         The coadds.
-    index : int
-        Index of the unit of the tile and band.
-    members : ndarray of int
-        Rows in the pointings table of the exposures that touch the tile.
+    tile : int
+        Index of the tile.
+    band : str
     ra, dec : float, degrees
         Position.
     target : WCS
         WCS of the tile.
     """
     table, instrument = coadds.exposures.table, coadds.instrument
+    column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
+    (place,) = coadds.patches.touching((slice(row, row + 1), slice(column, column + 1)))
+    index = coadds.index(tile, band, *place)
+    patch = coadds.patch(index)
+    members = patch.members
     if coadds.has(index):
-        column, row = (int(round(float(value))) for value in target.all_world2pix(ra, dec, 0))
+        row, column = row - patch.corner[0], column - patch.corner[1]
         loaded = coadds.load(index, ("set", "sets"), (slice(row, row + 1), slice(column, column + 1)))
         sets = loaded["sets"]
         members = members[sets["input"][sets["set"] == int(loaded["set"].item())].to_numpy()]

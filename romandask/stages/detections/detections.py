@@ -101,7 +101,7 @@ def detections(coadds: Coadds, settings: DetectionSettings, region: Region) -> D
     }
 
     def inputs(k: int, tile: Tile) -> tuple[tuple[str, str], ...]:
-        images = tuple((coadds.stage, f"{tile.name}-{band}") for band in bands)
+        images = tuple((coadds.stage, coadds.names[unit]) for band in bands for unit in coadds.units_of(k, band))
         # the extinction by the Milky Way is that of true galaxies nearby
         return images + coadds.truth.inputs(*tile_cone(coadds, k))
 

@@ -7,7 +7,7 @@ memory at a time; the detection image is made from small windows of all bands.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -25,6 +25,7 @@ from romandask.kernels.measurement.measurement_image import (
 )
 from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.products.memory import release_free_memory
+from romandask.products.mosaic import Mosaic
 from romandask.stages.coadds.tile_maker import Coadds
 from romandask.storage.arrays import chunk_side
 
@@ -148,22 +149,22 @@ class TileField(Field):
     """Coadds of the survey."""
     tile: int
     """Index of the tile."""
-    readers: dict[int, Callable[[str, Window], np.ndarray]] = field(default_factory=dict)
-    """Cache of functions that return a window of an array, by index of the unit of the coadds. They read the store, or
-    the memory if the unit is not stored and was made."""
+    images: dict[str, Mosaic] = field(default_factory=dict)
+    """Readers of windows of the tile by band. They read the store, or the memory where a patch is not stored and was
+    made."""
 
     def arrays(self, band: str, names: tuple[str, ...], window: Window = WHOLE) -> dict[str, np.ndarray]:
         """Return arrays of a band, by name (see `Field.arrays`); `noise` is the first realisation."""
-        index = self.coadds.index(self.tile, band)
-        if index not in self.readers:
-            if self.coadds.has(index):
-                self.readers[index] = self.coadds.reader(index)
+        image = self.images.setdefault(band, self.coadds.tile_image(self.tile, band))
+        arrays = {}
+        for name in names:
+            if name == "psf":
+                arrays[name] = self.coadds.tile_psf(self.tile, band)
+            elif name == "noise":
+                arrays[name] = image(name, (slice(0, 1), *window))[0]
             else:
-                made = self.coadds.load(index)
-                self.readers[index] = lambda name, part: made[name][(..., *part)].copy()
-        windows = {name: {"psf": (), "noise": (slice(0, 1), *window)}.get(name, window) for name in names}
-        arrays = {name: self.readers[index](name, part) for name, part in windows.items()}
-        return {name: array[0] if name == "noise" else array for name, array in arrays.items()}
+                arrays[name] = image(name, window)
+        return arrays
 
 
 @dataclass(frozen=True, kw_only=True)

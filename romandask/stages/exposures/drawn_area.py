@@ -10,7 +10,7 @@ import pandas as pd
 from astropy.wcs import WCS
 
 from romandask.kernels.coadding.background import BACKGROUND_MESH
-from romandask.kernels.coadding.pixel_map import strips
+from romandask.kernels.coadding.pixel_map import pixel_map, strips
 from romandask.kernels.detectors.simple_detector import NOISE_BLOCK
 from romandask.model.sky import touching_pairs
 from romandask.model.tiles import Tile
@@ -50,11 +50,11 @@ class DrawnArea:
         shape : (int, int)
             Rows and columns of the detector.
         """
-        size = (self.pixels, self.pixels)
+        detector, tile_window = [slice(0, length) for length in shape], (slice(0, self.pixels), slice(0, self.pixels))
         parts = [
             strip
             for tile in self.tiles.get(row, ())
-            for strip in strips(frame, shape, WCS(tile.header(self.pixels, self.scale)), size)
+            for strip in strips(pixel_map(frame, WCS(tile.header(self.pixels, self.scale)), *detector), tile_window)
         ]
         if not parts:
             return slice(0, 0), slice(0, 0)

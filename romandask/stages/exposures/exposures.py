@@ -18,6 +18,7 @@ from astropy.wcs import WCS
 from romandask.instruments.exposure import Exposure, exposure_of, exposures_of
 from romandask.instruments.instrument import Instrument
 from romandask.instruments.psf_image import flat_shares
+from romandask.kernels.coadding.background import mesh_shape
 from romandask.kernels.detectors.simple_detector import Detector, usable
 from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.model.settings import RenderSettings
@@ -70,7 +71,7 @@ class Exposures(ImageSet):
         return self.instrument.shape
 
     @property
-    def unit_bands(self) -> np.ndarray:
+    def image_bands(self) -> np.ndarray:
         """Band of each exposure, shape (n,)."""
         return self.table["band"].to_numpy(object)
 
@@ -78,6 +79,21 @@ class Exposures(ImageSet):
     def extra_layers(self) -> dict[str, tuple[str, str, str]]:
         """Dtype, unit and description of the layers of cutouts that are not stored, by name."""
         return LAYERS
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of the exposures."""
+        return self.names
+
+    def load_image(self, image: int, names: tuple[str, ...], window: tuple[slice, ...] = ()) -> dict[str, np.ndarray]:
+        """Return a window of arrays of an exposure, by name."""
+        return self.load(image, names, window)
+
+    def with_mesh(self, index: int, names: tuple[str, ...], window: tuple[slice, slice]) -> dict[str, np.ndarray]:
+        """Return a window of those arrays of an exposure that there are, and its whole `background_mesh`, by name."""
+        image = self.image(index)
+        known = [variable.name for variable in self.product.variables if variable.name in names]
+        return {**{name: image(name, window) for name in known}, "background_mesh": image("background_mesh")}
 
     def exposure(self, index: int) -> Exposure:
         """Return one exposure."""
@@ -253,11 +269,21 @@ def exposures(
         axes=("y", "x"),
         attributes={**image.attributes, "long_name": "noiseless image of the objects"},
     )
+    mesh = Variable(
+        name="background_mesh",
+        dtype="float32",
+        shape=mesh_shape(instrument.shape),
+        axes=("mesh_y", "mesh_x"),
+        attributes={
+            "units": "electron",
+            "long_name": "smooth background estimated from the image, as coadds subtract it",
+        },
+    )
     product = ImageProduct(
         stage=stage_of(instrument),
         units=LazyUnits(tuple(names), unit),
         make=renderer,
-        variables=(image, noiseless, *others),
+        variables=(image, noiseless, *others, mesh),
         axes=axes,
         lengths=(len(table),),
         coordinates=coordinates,

@@ -13,7 +13,8 @@ from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument, Readout
-from romandask.kernels.detectors.simple_detector import WHOLE
+from romandask.kernels.coadding.background import background_mesh
+from romandask.kernels.detectors.simple_detector import WHOLE, usable
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
@@ -164,7 +165,9 @@ class RenderExposure:
 
     def __call__(self, index: int) -> dict[str, Any]:
         """Return the arrays and tables, by name, of the exposure in a row of the pointings table."""
-        return self.readout(self.view(index), self.left(index))
+        arrays = self.readout(self.view(index), self.left(index))
+        # what coadds need of the whole exposure is found once, so that they can read windows of it
+        return {**arrays, "background_mesh": background_mesh(arrays["image"], ~usable(arrays["dq"]))}
 
     def left(self, index: int) -> list[tuple[Exposure, pd.DataFrame]]:
         """Return the earlier exposures whose trapped charge affects an exposure, each with its table of that charge."""

@@ -6,7 +6,7 @@ import pytest
 from astropy.wcs import WCS
 
 from romandask.kernels.coadding.coadd_psf import warped_psf
-from romandask.kernels.coadding.pixel_map import pixel_map, strips
+from romandask.kernels.coadding.pixel_map import bounds, pixel_map, strips
 from romandask.kernels.coadding.warp import REACH, Means, lanczos_weights
 from romandask.model.seeds import rng
 from romandask.model.tiles import tangent_header
@@ -35,8 +35,8 @@ def warped(planes, bad, marked=None, weight=2.0, side=120):
     """Return the sums after adding one exposure to a tile, and the number of tile pixels that it contributes to."""
     tile, frame, shape = frames(side=side)
     sums = Means((side, side), len(planes))
-    tile_strips = strips(tile, (side, side), frame, shape)
-    onto = pixel_map(tile, frame, slice(tile_strips[0].rows.start, tile_strips[-1].rows.stop), tile_strips[0].columns)
+    onto = pixel_map(tile, frame, slice(0, side), slice(0, side))
+    onto = onto.part(*bounds(strips(onto, (slice(0, shape[0]), slice(0, shape[1])))))
     marked = np.zeros(shape, bool) if marked is None else marked
     covered = sums.add(planes, bad, marked, weight, onto, (0, 0))
     return sums, covered
@@ -112,8 +112,8 @@ def test_means_are_weighted_and_marks_surround_marked_pixels():
     bad[60, 70] = True
     sums, _ = warped(np.ones((2, *shape), np.float32), bad, bad.copy(), weight=3.0)
     tile, frame, _ = frames()
-    tile_strips = strips(tile, (120, 120), frame, shape)
-    onto = pixel_map(tile, frame, slice(tile_strips[0].rows.start, tile_strips[-1].rows.stop), tile_strips[0].columns)
+    onto = pixel_map(tile, frame, slice(0, 120), slice(0, 120))
+    onto = onto.part(*bounds(strips(onto, (slice(0, shape[0]), slice(0, shape[1])))))
     sums.add(np.full((2, *shape), 5, np.float32), none, none, 1.0, onto, (0, 0))
     both = sums.count == 2
     once = sums.count == 1

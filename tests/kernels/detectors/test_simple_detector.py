@@ -10,7 +10,6 @@ from romandask.kernels.detectors.simple_detector import (
     NOT_DRAWN_VALUE,
     SATURATED,
     Detector,
-    noise_realisation,
     observe,
     usable,
 )
@@ -69,14 +68,3 @@ def test_a_window_has_the_pixels_of_the_whole_detector_and_the_rest_is_not_drawn
     assert not usable(part_dq[outside]).any()
     assert (dq & SATURATED > 0).any()
     assert not (dq & NOT_DRAWN).any()
-
-
-def test_a_noise_realisation_does_not_depend_on_the_requested_part():
-    def part(rows, columns):
-        shape = (rows.stop - rows.start, columns.stop - columns.start)
-        return noise_realisation(np.full(shape, 100 + 8.5**2, np.float32), 400, rows, columns, lambda k: rng(5, "n", k))
-
-    whole = part(slice(0, 700), slice(0, 400))
-    np.testing.assert_array_equal(whole[300:600, 37:90], part(slice(300, 600), slice(37, 90)))
-    assert whole.std() == pytest.approx(np.sqrt(100 + 8.5**2), rel=0.01)
-    assert whole.mean() == pytest.approx(0, abs=0.1)

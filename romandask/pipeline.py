@@ -17,6 +17,7 @@ from romandask.model.settings import (
     CoaddSettings,
     DetectionSettings,
     DifferenceSettings,
+    ExposureSettings,
     LensingSettings,
     MatchSettings,
     RegionSettings,
@@ -44,6 +45,7 @@ class Pipeline(Section):
     # instruments, in the order in which their products are made; a new telescope is one line here
     roman: RomanSettings | None = None
     rubin: RubinSettings | None = None
+    exposures: ExposureSettings = ExposureSettings()
     coadds: CoaddSettings = CoaddSettings()
     detections: DetectionSettings = DetectionSettings()
     matches: MatchSettings = MatchSettings()

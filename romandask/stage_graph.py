@@ -23,6 +23,7 @@ from romandask.stages.detections.zero_points import ZERO_POINTS
 from romandask.stages.exposures.exposures import EXPOSURES
 from romandask.stages.pointings import POINTINGS
 from romandask.stages.psf_images import PSF_IMAGES
+from romandask.stages.psf_models import PSF_MODELS
 from romandask.stages.stage import Stage, SurveyContext
 from romandask.stages.truth.catalogs import GALAXIES, INGESTED, QUARANTINE, STARS, STRUCTURE
 from romandask.stages.truth_index import TRUTH_INDEX
@@ -36,6 +37,7 @@ STAGES: tuple[Stage, ...] = (
     QUARANTINE,
     POINTINGS,
     CALIBRATION,
+    PSF_MODELS,
     EXPOSURES,
     COADDS,
     COADD_NOISE,

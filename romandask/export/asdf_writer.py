@@ -21,6 +21,7 @@ from romandask.model.errors import UserError
 FLAG_NAMES = {
     "saturated": "SATURATED",
     "no_data": "DO_NOT_USE",
+    "not_drawn": "DO_NOT_USE",
     "disconnected": "DEAD",
     "hot": "HOT",
     "adjacent": "OTHER_BAD_PIXEL",

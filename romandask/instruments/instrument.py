@@ -19,6 +19,7 @@ from romandask.instruments.exposure import Exposure
 from romandask.instruments.readout import Light, Readout
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
+from romandask.kernels.rendering.psf_layout import PsfLayout
 from romandask.model.settings import Section
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
@@ -209,6 +210,14 @@ class Instrument(Protocol):
     @property
     def psf_settings(self) -> dict[str, object]:
         """Settings on which PSFs depend; part of the input hash of images that are drawn with the PSFs."""
+
+    @property
+    def psf_layout(self) -> PsfLayout | None:
+        """Largest sizes of the PSF models in any band, or None if each exposure has a PSF of its own.
+
+        With a layout, all exposures of a detector and band must have the same PSF: it is then sampled once, in a stage
+        of its own, and stored.
+        """
 
     def psf(self, exposure: Exposure) -> PsfModel:
         """Return the chromatic PSF of an exposure, as it varies over the detector."""

@@ -29,7 +29,14 @@ class Light(Protocol):
 
     @property
     def background(self) -> np.ndarray:
-        """Expected electrons that do not come from objects, shape (ny, nx); see `Instrument.background`."""
+        """Expected electrons that do not come from objects, shape (ny, nx); see `Instrument.background`.
+
+        They are 0 outside `window`.
+        """
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the detector that are drawn; all of them for a readout that does not draw parts."""
 
     @property
     def scene(self) -> Scene:
@@ -79,6 +86,10 @@ class Readout(Protocol):
     @property
     def tables(self) -> dict[str, pa.Schema]:
         """Schemas, by name, of the tables stored with an exposure; at most one, the result of `leave`."""
+
+    @property
+    def draws_parts(self) -> bool:
+        """True if a part of a detector can be read out without the rest: no effect spreads over the detector."""
 
     @property
     def seconds_per_pixel(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.readout import Light
-from romandask.kernels.detectors.simple_detector import DQ_FLAGS, Detector, observe
+from romandask.kernels.detectors.simple_detector import NOT_DRAWN_VALUE, SIMPLE_FLAGS, WHOLE, Detector, observe
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
@@ -30,16 +31,17 @@ class SimpleReadout:
     seed: int
     """Seed of the survey."""
     seconds_per_pixel: float = 2.5e-7
+    draws_parts: bool = True
 
     @property
     def variables(self) -> tuple[Variable, ...]:
         """The observed image and its data quality."""
         quality = {
             "long_name": "data quality",
-            "flag_masks": list(DQ_FLAGS.values()),
-            "flag_meanings": " ".join(DQ_FLAGS),
+            "flag_masks": list(SIMPLE_FLAGS.values()),
+            "flag_meanings": " ".join(SIMPLE_FLAGS),
         }
-        electrons = {"units": "electron", "long_name": "observed image"}
+        electrons = {"units": "electron", "long_name": "observed image", "not_drawn_value": NOT_DRAWN_VALUE}
         return (
             Variable("image", "int32", self.shape, ("y", "x"), electrons),
             Variable("dq", "uint8", self.shape, ("y", "x"), quality),
@@ -70,6 +72,10 @@ class SimpleReadout:
     def __call__(self, light: Light, left: Sequence[tuple[Exposure, pd.DataFrame]]) -> dict[str, Any]:
         """Return image, truth and dq of an exposure; `left` is not used."""
         exposure, expected = light.exposure, light.expected()
-        random = rng(self.seed, "exposures", self.name, exposure.visit, exposure.detector)
-        image, dq = observe(expected, light.background, self.detector, random)
+        generator = partial(rng, self.seed, "exposures", self.name, exposure.visit, exposure.detector)
+        image, dq = observe(expected, light.background, self.detector, generator, light.window)
+        if light.window != WHOLE:
+            drawn = expected[light.window]
+            expected = np.full(expected.shape, NOT_DRAWN_VALUE, np.float32)
+            expected[light.window] = drawn
         return {"image": image, "truth": expected, "dq": dq}

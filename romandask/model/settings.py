@@ -151,6 +151,12 @@ class RenderSettings(Section):
     largest: int = Field(2048, ge=64, le=4096, description="largest stamp, pixels a side (a power of two)")
 
 
+class ExposureSettings(Section):
+    """Exposures. Only simple detectors (Roman's `detector: simple`) are drawn in part; others are always whole."""
+
+    area: Literal["detector", "region"] = Field("detector", description="draw whole detectors, or what the tiles need")
+
+
 class CoaddSettings(Section):
     """The tile grid and the coaddition.
 

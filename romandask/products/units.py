@@ -24,8 +24,6 @@ class Unit:
     `inputs`."""
     optional: tuple[tuple[str, str], ...] = ()
     """(stage, unit) of upstream units that this unit reads if they are stored, and does not need."""
-    affinity: str = ""
-    """Affinity key: units with the same key are made one after another, so that a worker can reuse its caches."""
 
 
 @dataclass(frozen=True)

@@ -6,20 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from romandask.instruments.exposure import Exposure, exposure_of
-from romandask.instruments.instrument import Instrument
-from romandask.kernels.rendering.oversampled_image import fine_image
+from romandask.instruments.exposure import exposure_of
+from romandask.instruments.psf_image import OVERSAMPLING, PSF_IMAGE_PIXELS
 from romandask.products.images import ImageProduct
 from romandask.products.units import LazyUnits, Unit
-from romandask.stages.exposures.exposures import Exposures, flat_shares
+from romandask.stages.exposures.exposures import Exposures
 from romandask.stages.exposures.render import RenderExposure
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage
 from romandask.storage.arrays import Variable
-
-OVERSAMPLING = 8
-"""Samples per native pixel, along each axis."""
-PSF_IMAGE_PIXELS = 64
-"""Side of a PSF image, native pixels."""
 
 
 def psfs(exposures: Exposures) -> ImageProduct:
@@ -65,40 +59,11 @@ class MakePsf:
     """Makes the PSF image of one exposure."""
 
     render: RenderExposure
-    """Holds the pointings table and the instrument."""
+    """Holds the pointings table and the PSFs."""
 
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Return the PSF image of the exposure in a row of the pointings table, by name."""
-        exposure, instrument = exposure_of(self.render.table.iloc[index]), self.render.instrument
-        ny, nx = instrument.shape
-        return {"psf": psf_image(instrument, exposure, (nx - 1) / 2, (ny - 1) / 2)}
-
-
-def psf_image(
-    instrument: Instrument, exposure: Exposure, x: float, y: float, shares: np.ndarray | None = None
-) -> np.ndarray:
-    """Return the oversampled image of a star of unit flux at a position on the detector.
-
-    Parameters
-    ----------
-    instrument : Instrument
-        Instrument of the exposure.
-    exposure : Exposure
-        Exposure whose PSF is sampled.
-    x, y : float, pixels
-        Position on the detector.
-    shares : ndarray, shape (nodes,), optional
-        Photons of the star's spectrum at each PSF node of the band, in any unit; by default those of a star of flat
-        f_nu.
-
-    Returns
-    -------
-    ndarray, shape (n, n), with n = PSF_IMAGE_PIXELS * OVERSAMPLING
-        Image as described in `psfs`.
-    """
-    bandpass = instrument.bandpass(exposure.band)
-    shares = flat_shares(bandpass) if shares is None else np.asarray(shares, float) / np.sum(shares)
-    return fine_image(instrument.psf_at(exposure, x, y), shares, x, y, PSF_IMAGE_PIXELS, OVERSAMPLING)
+        return {"psf": self.render.psfs.centre(exposure_of(self.render.table.iloc[index]))}
 
 
 PSF_IMAGES = Stage(

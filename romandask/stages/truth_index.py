@@ -63,8 +63,8 @@ def index_of(view: View, ab_photons: float) -> pd.DataFrame:
     drawable, truth = view.drawable, view.truth
     n = len(drawable.reasons)
     reasons, flux, stamp = drawable.reasons.copy(), np.zeros(n), np.zeros(n, np.int32)
-    stamp[drawable.rows] = view.stamps.size
-    reasons[drawable.rows[view.stamps.size == 0]] = OFF_IMAGE
+    stamp[drawable.rows] = np.where(view.shown, view.stamps.size, 0)
+    reasons[drawable.rows[~view.shown]] = OFF_IMAGE
     drawn = stamp > 0
     total = np.zeros(n)
     total[drawable.rows] = drawable.scene.fluxes()
@@ -96,7 +96,7 @@ TRUTH_INDEX = Stage(
     per_survey=True,
     build=lambda context, survey: truth_index(context.output(f"exposures/{survey}")),
     exists=has_exposures,
-    reads=("truth/galaxies", "truth/stars", "calibration"),
+    reads=("truth/galaxies", "truth/stars", "calibration", "psf_models"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="visit and detector",
     summary="Position, flux and magnitude of every object with light on an exposure, or why it is not drawn.",

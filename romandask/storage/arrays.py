@@ -48,6 +48,9 @@ class Variable:
     """Zarr attributes: units, long_name, ..."""
     compress: bool = True
     """False where compression would gain little and slow down every reader; each chunk is then a file of full rows."""
+    zeros: bool = False
+    """True for a variable that is not compressed but has large areas of zeros, which are then stored as almost nothing
+    (LZ4, which copies other values as they are)."""
 
     @property
     def is_image(self) -> bool:
@@ -208,6 +211,8 @@ def open_images(path: AnyPath, layout: Layout) -> zarr.Group:
                 array.update_attributes(variable.attributes)
                 continue
         packing = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")] if variable.compress else []
+        if variable.zeros:
+            packing = [BloscCodec(cname="lz4", clevel=1, shuffle="noshuffle")]
         group.create_array(
             variable.name,
             shape=shape,
@@ -232,7 +237,7 @@ def limited_concurrency() -> Any:
 
 
 def write_array(
-    array: zarr.Array[Any], unit_index: tuple[int, ...], values: np.ndarray, corner: tuple[int, int] = (0, 0)
+    array: zarr.Array[Any], unit_index: tuple[int, ...], values: np.ndarray, corner: tuple[int, ...] = (0, 0)
 ) -> None:
     """Write the values of one unit, one file of its last two axes at a time.
 
@@ -249,12 +254,13 @@ def write_array(
         Values of the unit.
     corner : (int, int)
         Row and column of the first pixel of the unit in the stored image, which has the pixels of other units too if it
-        is divided into patches.
+        is divided into patches; an array of one axis has only the second.
     """
     # a setting of the writer, not of the array; without it, chunks of zeros would not be written and would be missing
     array = array.with_config({"write_empty_chunks": True})
     file_shape = (array.shards or array.chunks)[len(unit_index) :]
     starts = [range(0, length, step) for length, step in zip(values.shape[-2:], file_shape[-2:], strict=True)]
+    corner = corner[-len(starts) :]
     for start in itertools.product(*starts):
         ends = [
             min(low + step, length) for low, step, length in zip(start, file_shape[-2:], values.shape[-2:], strict=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -81,7 +82,7 @@ def run(folder: Path) -> None:
 
     # the simple model before, between and after: what else the machine does is in all of them
     def observed() -> float:
-        return seconds(lambda: observe(light, 0.0, Detector(1e5, 8.5), rng(SEED, "simple")))
+        return seconds(lambda: observe(light, 0.0, Detector(1e5, 8.5), partial(rng, SEED, "simple")))
 
     simple = [observed()]
     kept = seconds(lambda: every_effect(in_memory))

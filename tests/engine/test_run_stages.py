@@ -325,14 +325,16 @@ def test_every_stage_is_after_the_stages_that_it_reads():
 
 def test_the_stage_diagram_has_an_arrow_for_each_direct_read():
     arrows = _reduced(kinds_read(stage_products(Survey(load_pipeline("tiny")))))
-    assert arrows["exposures"] == {"truth", "pointings"}
+    assert arrows["exposures"] == {"truth", "psf_models"}
+    assert arrows["psf_models"] == {"pointings"}
     assert arrows["coadds"] == {"exposures"}, "indirect reads are not drawn"
     assert arrows["differences"] == arrows["truth_match"] == {"detections"}
-    assert arrows["truth_index"] == {"truth", "pointings"}
+    assert arrows["truth_index"] == {"truth", "psf_models"}
     assert arrows["statistics"] == {"matches", "chance"}
     assert not arrows["truth"]
     assert not arrows["pointings"]
     arrows = _reduced(kinds_read(stage_products(Survey(load_pipeline("tiny", ["roman.detector=sca"])))))
-    assert arrows["exposures"] == {"truth", "calibration"}
+    assert arrows["exposures"] == {"truth", "psf_models"}
+    assert arrows["psf_models"] == {"calibration"}
     assert arrows["calibration"] == {"pointings"}
     assert arrows["coadds"] == {"exposures"}

@@ -11,12 +11,12 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from romandask.export.meds import Catalog, write_meds
+from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.detectors.simple_detector import NO_DATA
 from romandask.model.errors import UserError
 from romandask.model.sky import Cone, Region, covering_pairs
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.cutouts import cutouts
-from romandask.stages.psf_images import flat_shares
 from romandask.stages.wanted import Positions, located
 
 SIZE = 32

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from romandask.instruments.exposure import Exposure
+from romandask.instruments.psf_image import OVERSAMPLING, PSF_IMAGE_PIXELS, flat_shares, psf_image
 from romandask.instruments.roman.roman import RomanSettings
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.rendering.seeing import fried, kolmogorov_transfer, von_karman_transfer
-from romandask.stages.psf_images import OVERSAMPLING, PSF_IMAGE_PIXELS, flat_shares, psf_image, psfs
+from romandask.stages.psf_images import psfs
 
 
 def drawn(instrument, exposure, x, y):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
-from tempfile import TemporaryFile
 from threading import RLock
-from typing import Any
+from typing import Any, overload
 
 import galsim
 import galsim.roman
@@ -160,7 +159,6 @@ def edges(sca: int, band: str, n_waves: int, diffusion: float) -> dict[int, floa
     return edge_brightness(transforms(sca, band, waves[[0, -1]], 8, MIDDLE, grid, diffusion), grid)
 
 
-@lru_cache(maxsize=1)
 @_one_thread
 def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -> PsfModel:
     """Return the PSF of an SCA and band, which varies over the SCA.
@@ -192,7 +190,7 @@ def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -
 
 
 @dataclass(frozen=True, kw_only=True)
-class WideNodes:
+class WideNodes(Sequence[np.ndarray]):
     """PSFs of a finer pupil in the middle of an SCA, for `BrightPsf.nodes`."""
 
     sca: int
@@ -208,35 +206,20 @@ class WideNodes:
     diffusion: float
     """Sigma of the diffusion of charge, pixels."""
 
-    def __call__(self) -> Iterator[np.ndarray]:
-        """Yield the transforms (grid.shape) of the PSFs, one at a time."""
-        samples, size = _wide_samples(self), int(np.prod(self.grid.shape))
-        for number in range(len(self.waves)):
-            # other threads read the same file
-            with _LOCK:
-                samples.file.seek(number * size * np.dtype(np.complex64).itemsize)
-                transform = np.fromfile(samples.file, np.complex64, size)
-            yield transform.reshape(self.grid.shape)
+    def __len__(self) -> int:
+        return len(self.waves)
 
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        """Return the transform (grid.shape) of the PSF at a wavelength, or a list of those of a slice."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        return self._transform(self.waves[index])
 
-class _Samples:
-    """Transforms in an unnamed temporary file, which is deleted with this object or when the worker ends."""
-
-    def __init__(self) -> None:
-        self.file = TemporaryFile(prefix="romandask-")
-
-    def __del__(self) -> None:
-        self.file.close()
-
-
-@lru_cache(maxsize=2)
-@_one_thread
-def _wide_samples(nodes: WideNodes) -> _Samples:
-    """Return the file of the transforms of some nodes; they take long to compute and are too large for memory."""
-    samples = _Samples()
-    for wave in nodes.waves:
-        transform = transforms(
-            nodes.sca, nodes.band, np.array([wave]), nodes.pupil_bin, MIDDLE, nodes.grid, nodes.diffusion
-        )
-        transform.tofile(samples.file)
-    return samples
+    @_one_thread
+    def _transform(self, wave: float) -> np.ndarray:
+        transform = transforms(self.sca, self.band, np.array([wave]), self.pupil_bin, MIDDLE, self.grid, self.diffusion)
+        return transform[0]

@@ -37,6 +37,7 @@ from romandask.instruments.roman.sun import FURTHEST, NEAREST, sun_angle
 from romandask.instruments.simple_readout import SimpleReadout
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, Grid, PsfModel, model
+from romandask.kernels.rendering.psf_layout import PsfLayout
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass
 from romandask.model.settings import distinct, one_of
 from romandask.model.sky import Region
@@ -143,6 +144,21 @@ class Roman:
         """Return sigma, pixels, of the diffusion of charge in an SCA before the charge is collected."""
         return self.settings.charge_diffusion if self.calibration is None else self.calibration.diffusion(sca)
 
+    @property
+    def psf_layout(self) -> PsfLayout:
+        """Sizes of the PSF models of all bands: the PSF is the same in all exposures of an SCA and band."""
+        folds, degree = max(band.frequency_folds for band in BANDS.values()), self.settings.psf_degree
+        bright = sorted(self.settings.bright_stars.items(), reverse=True)
+        return PsfLayout(
+            nodes=self.n_waves,
+            grid=Grid(PSF_EXTENT_PIXELS // 8, folds),
+            positions=(degree + 1) * (degree + 2) // 2 if degree else 0,
+            bright=tuple(
+                (len(_bright_waves(np.arange(self.n_waves), pupil_bin)), _bright_grid(folds, pupil_bin))
+                for _, pupil_bin in bright
+            ),
+        )
+
     def psf(self, exposure: Exposure) -> PsfModel:
         """Return the PSF of the SCA and band of an exposure, which varies over the SCA."""
         sca, degree = exposure.detector, self.settings.psf_degree
@@ -180,13 +196,10 @@ class Roman:
         zero_point = bandpass.ab_photons() * exposure.exptime
         psfs = []
         for magnitude, pupil_bin in sorted(self.settings.bright_stars.items(), reverse=True):
-            # the core of the brightest stars is far above saturation; three wavelengths are enough for their spikes
-            waves = bandpass.nodes if pupil_bin == 4 else np.linspace(bandpass.nodes[0], bandpass.nodes[-1], 3)
+            waves = _bright_waves(bandpass.nodes, pupil_bin)
             position = np.interp(bandpass.nodes, waves, np.arange(len(waves)))
             shares = np.clip(1 - np.abs(position[:, None] - np.arange(len(waves))), 0, 1)
-            # only the core has power at the highest frequencies of the short bands
-            folds = BANDS[exposure.band].frequency_folds if pupil_bin == 4 else 2
-            grid = Grid(PSF_EXTENT_PIXELS // pupil_bin, folds)
+            grid = _bright_grid(BANDS[exposure.band].frequency_folds, pupil_bin)
             nodes = WideNodes(
                 sca=exposure.detector,
                 band=exposure.band,
@@ -257,6 +270,18 @@ class Roman:
     ) -> dict[str, np.ndarray]:
         """Return an image of each effect of an SCA; none for the simple detector."""
         return effect_images(readout, light, expected, left) if isinstance(readout, ScaReadout) else {}
+
+
+def _bright_waves(nodes: np.ndarray, pupil_bin: int) -> np.ndarray:
+    """Return the wavelengths at which a PSF of bright stars is sampled, given the nodes of the band."""
+    # the core of the brightest stars is far above saturation; three wavelengths are enough for their spikes
+    return nodes if pupil_bin == 4 else np.linspace(nodes[0], nodes[-1], 3)
+
+
+def _bright_grid(folds: int, pupil_bin: int) -> Grid:
+    """Return the frequencies of a PSF of bright stars, given the highest frequency of the band."""
+    # only the core has power at the highest frequencies of the short bands
+    return Grid(PSF_EXTENT_PIXELS // pupil_bin, folds if pupil_bin == 4 else 2)
 
 
 def _date(mjd: float) -> datetime:

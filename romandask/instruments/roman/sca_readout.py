@@ -108,6 +108,7 @@ class ScaReadout:
     cosmic_rays: bool
     """True to add cosmic rays."""
     seconds_per_pixel: float = 7e-7
+    draws_parts: bool = False
 
     @property
     def variables(self) -> tuple[Variable, ...]:

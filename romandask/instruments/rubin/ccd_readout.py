@@ -46,6 +46,7 @@ class CcdReadout:
     sensor: Literal["ideal", "silicon"]
     """With "silicon", bright objects are drawn photon by photon with GalSim's model of the CCD."""
     seconds_per_pixel: float = 7e-7
+    draws_parts: bool = False
 
     @property
     def variables(self) -> tuple[Variable, ...]:

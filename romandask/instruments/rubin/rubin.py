@@ -21,6 +21,7 @@ from romandask.instruments.rubin.focal_plane import CENTRES, DETECTOR_SHAPE, PIX
 from romandask.instruments.rubin.psf import RubinPsf
 from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
+from romandask.kernels.rendering.psf_layout import PsfLayout
 from romandask.kernels.universe.bandpasses import rubin_bandpass
 from romandask.model.settings import distinct, one_of
 from romandask.model.sky import Region
@@ -72,6 +73,7 @@ class Rubin:
     detection_bands: tuple[str, ...] | None = None
     detector: Detector = Detector(saturation=1e5, read_noise=9.0)
     visit_seconds: float = 30.0
+    psf_layout: PsfLayout | None = None
 
     @property
     def bands(self) -> tuple[str, ...]:

@@ -113,7 +113,7 @@ def draw(
     for number, star_psf in enumerate(bright):
         size = np.where(stamps.bright == number, stamps.size, 0)
         if size.any():
-            draw_wide(image, scene, scene.photons @ star_psf.shares, star_psf.nodes(), star_psf.grid, size)
+            draw_wide(image, scene, scene.photons @ star_psf.shares, star_psf.nodes, star_psf.grid, size)
     return image
 
 

@@ -6,7 +6,7 @@ Positions are pixel coordinates x, y, 0 at the centre of the first pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -80,8 +80,8 @@ class BrightPsf:
     """Smallest flux, electrons, of the stars that are drawn with this PSF."""
     grid: Grid
     """Frequencies of the transforms."""
-    nodes: Callable[[], Iterator[np.ndarray]]
-    """Function that yields the transforms (grid.shape) one at a time, because they are large."""
+    nodes: Sequence[np.ndarray]
+    """Transforms, each of grid.shape; they are large, so each is made or read when it is accessed."""
     shares: np.ndarray
     """Fractions of the light of the band's nodes at the nodes of this PSF, shape (band nodes, nodes of this PSF)."""
 

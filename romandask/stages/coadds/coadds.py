@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from romandask.instruments.exposure import EXPOSURE_COLUMNS
+from romandask.instruments.exposure import EXPOSURE_COLUMNS, exposures_of
 from romandask.instruments.instrument import Instrument
 from romandask.kernels.detectors.simple_detector import SATURATED
 from romandask.model.settings import CoaddSettings
@@ -81,6 +81,7 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
         # the arrays of all patches are as long as that of the patch with most exposures needs: if it changes, all are
         # remade
         shared["inputs"] = most_inputs(members)
+    all_exposures = exposures_of(table)
     places = [(row, column) for row in range(patches.count) for column in range(patches.count)]
     unit_names = tuple(
         f"{tile.name}-{band}-{patches.name(*place)}" for tile in tiles for band in instrument.bands for place in places
@@ -96,7 +97,8 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
             inputs = renderer.truth.inputs(*cone(patch.footprint))
         else:
             unit_settings["exposures"] = names[chosen].tolist()
-            inputs = tuple((exposures.stage, name) for name in names[chosen])
+            psf_units = dict.fromkeys(source for row in chosen for source in renderer.psfs.inputs(all_exposures[row]))
+            inputs = (*((exposures.stage, name) for name in names[chosen]), *psf_units)
         return Unit(name=unit_names[index], settings=unit_settings, inputs=inputs, cost=1.0 + len(chosen))
 
     def coordinates() -> Coordinates:
@@ -239,7 +241,7 @@ COADDS = Stage(
     name="coadds",
     per_survey=True,
     build=build_coadds,
-    reads=("exposures", "truth/galaxies", "truth/stars"),
+    reads=("exposures", "psf_models", "truth/galaxies", "truth/stars"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="patch of a tile in a band",
     summary="Image, weight, noise, number and sets of exposures, and PSFs of a patch, drizzled from exposures (square "

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from romandask.instruments.exposure import exposure_of
+from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.coadding.background import subtract_background
 from romandask.kernels.coadding.stack import stack
 from romandask.kernels.rendering.draw import Scene, draw, draw_wide, plan_stamps
@@ -17,7 +18,6 @@ from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
 from romandask.stages.coadds.input_psfs import psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
-from romandask.stages.exposures.exposures import flat_shares
 from romandask.stages.exposures.render import cone
 from romandask.stages.pointings import corners_of
 

@@ -44,12 +44,13 @@ class DrizzleTile(TileMaker):
         frames = [WCS(instrument.header(exposure)) for exposure in exposures]
         maps = [pixel_map(frame, target, *whole) for frame in frames]
         strips_of = [strips(onto, patch.window) for onto in maps]
+        sampled = self.exposures.renderer.psfs
         # PSFs are sampled before the sums are allocated, because sampling needs memory of its own
         psfs = np.zeros((most_inputs(self.members), *[psf_side(instrument)] * 2), np.float32)
         centre = patch.centre
         for number, (exposure, frame) in enumerate(zip(exposures, frames, strict=True)):
             if strips_of[number]:
-                psfs[number] = input_psf(instrument, exposure, frame, *centre, self.settings.pixfrac)
+                psfs[number] = input_psf(instrument, sampled, exposure, frame, *centre, self.settings.pixfrac)
         sums = Sums(shape, 1 + self.settings.noise, self.settings.pixfrac, patch.corner)
         saturated = [np.zeros(0, np.int32)]
         for i, exposure, onto, own_strips in zip(patch.members, exposures, maps, strips_of, strict=True):

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.instrument import Instrument
+from romandask.instruments.psf_image import OVERSAMPLING, psf_image
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import pixel_map
 from romandask.model.tiles import tangent_header
-from romandask.stages.psf_images import OVERSAMPLING, psf_image
+from romandask.stages.psf_models import Psfs
 
 PSF_RADIUS = 3.0
 """Half the side of the PSF images, arcsec (Roman: tile pixels of 0.0575 arcsec); above 0.1 arcsec it is proportional to
@@ -26,23 +23,6 @@ def psf_side(instrument: Instrument) -> int:
     """Return the side of the PSF images of the coadds of an instrument, pixels; an odd number."""
     radius = PSF_RADIUS * max(1.0, instrument.coadd_scale / 0.1)
     return 2 * int(round(radius / instrument.coadd_scale)) + 1
-
-
-@dataclass(frozen=True)
-class _CachedExposure:
-    """An exposure as a cache key: exposures with the same PSF are equal."""
-
-    key: tuple[Any, ...]
-    """Result of `Instrument.psf_key`."""
-    instrument: Instrument = field(compare=False)
-    exposure: Exposure = field(compare=False)
-
-
-@lru_cache(maxsize=40)
-def _centre_psf(cached: _CachedExposure) -> np.ndarray:
-    """Return the oversampled PSF at the centre of the detector (see `psf_image`)."""
-    ny, nx = cached.instrument.shape
-    return psf_image(cached.instrument, cached.exposure, (nx - 1) / 2, (ny - 1) / 2).astype(np.float32)
 
 
 def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:
@@ -66,7 +46,7 @@ def jacobian(source: WCS, target: WCS, x: float, y: float) -> np.ndarray:
 
 
 def input_psf(
-    instrument: Instrument, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float
+    instrument: Instrument, psfs: Psfs, exposure: Exposure, source: WCS, ra: float, dec: float, pixfrac: float
 ) -> np.ndarray:
     """Return the PSF of one exposure of a drizzled patch: the drizzled image of a star of unit flux and flat f_nu.
 
@@ -77,6 +57,8 @@ def input_psf(
     ----------
     instrument : Instrument
         Instrument of the exposure.
+    psfs : Psfs
+        PSFs of the exposures.
     exposure : Exposure
         The exposure.
     source : WCS
@@ -96,7 +78,7 @@ def input_psf(
     centre_ra, centre_dec = (float(value) for value in source.all_pix2world(x, y, 0))
     side = psf_side(instrument)
     target = WCS(tangent_header(centre_ra, centre_dec, side, instrument.coadd_scale))
-    fine = _centre_psf(_CachedExposure(instrument.psf_key(exposure), instrument, exposure))
+    fine = psfs.centre(exposure)
     return drizzled_psf(fine, OVERSAMPLING, jacobian(source, target, x, y), pixfrac, side).astype(np.float32)
 
 

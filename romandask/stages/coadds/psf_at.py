@@ -11,12 +11,12 @@ import xarray as xr
 from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of
+from romandask.instruments.psf_image import OVERSAMPLING, psf_image
 from romandask.kernels.coadding.coadd_psf import drizzled_psf
 from romandask.model.errors import UserError
 from romandask.model.spectra import Bandpass
 from romandask.stages.coadds.input_psfs import jacobian, psf_side, star_on
 from romandask.stages.coadds.tile_maker import Coadds
-from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
 Spectrum = Callable[[np.ndarray], np.ndarray]
 """Function that returns photons per nm, in any unit, at wavelengths in nm; for example a `galsim.SED`."""

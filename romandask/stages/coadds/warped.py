@@ -9,6 +9,7 @@ from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of, pixel_areas
 from romandask.instruments.instrument import Instrument
+from romandask.instruments.psf_image import OVERSAMPLING, psf_image
 from romandask.kernels.coadding.background import background_at
 from romandask.kernels.coadding.coadd_psf import warped_psf
 from romandask.kernels.coadding.pixel_map import bounds, pixel_map, strips
@@ -18,7 +19,6 @@ from romandask.model.spectra import NJY_ZERO_POINT
 from romandask.stages.coadds.exposure_noise import noise_realisations
 from romandask.stages.coadds.input_psfs import jacobian, psf_side
 from romandask.stages.coadds.tile_maker import TileMaker
-from romandask.stages.psf_images import OVERSAMPLING, psf_image
 
 
 @dataclass(frozen=True)

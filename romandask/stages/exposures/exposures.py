@@ -17,16 +17,18 @@ from astropy.wcs import WCS
 
 from romandask.instruments.exposure import Exposure, exposure_of, exposures_of
 from romandask.instruments.instrument import Instrument
+from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.coadding.background import mesh_shape
 from romandask.kernels.detectors.simple_detector import Detector, usable
 from romandask.kernels.rendering.oversampled_image import fine_image
 from romandask.model.settings import RenderSettings
-from romandask.model.spectra import Bandpass, ab_photon_density
 from romandask.products.image_set import ImageSet
 from romandask.products.images import Coordinates, ImageProduct
 from romandask.products.units import LazyUnits, Unit
+from romandask.stages.exposures.drawn_area import DrawnArea, drawn_area
 from romandask.stages.exposures.render import RenderExposure, cone, stage_of
 from romandask.stages.pointings import corners_of
+from romandask.stages.psf_models import Psfs, psfs_for, psfs_of
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.stages.truth.catalogs import truth_of
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
@@ -148,7 +150,7 @@ class Exposures(ImageSet):
             Each star is centred on pixel size // 2.
         """
         exposure, instrument = self.exposure(index), self.instrument
-        psf, shares = instrument.psf(exposure), flat_shares(instrument.bandpass(exposure.band))
+        psf, shares = self.renderer.psfs.model(exposure), flat_shares(instrument.bandpass(exposure.band))
         return np.stack([fine_image(psf, shares, x, y, size, 1) for x, y in positions]).astype(np.float32)
 
     def effects(self, index: int) -> dict[str, np.ndarray]:
@@ -165,12 +167,6 @@ class Exposures(ImageSet):
         return self.instrument.effects(renderer.readout, renderer.view(index), truth, renderer.left(index))
 
 
-def flat_shares(bandpass: Bandpass) -> np.ndarray:
-    """Return the fraction of the photons of a source of flat f_nu at each PSF node of a band, shape (nodes,)."""
-    photons = (ab_photon_density(bandpass.wave) * bandpass.weights) @ bandpass.node_weights()
-    return photons / photons.sum()
-
-
 def exposures(
     table: pd.DataFrame,
     truth: TruthCatalogs,
@@ -179,6 +175,8 @@ def exposures(
     seed: int,
     calibration: ImageProduct | None = None,
     store: Store | None = None,
+    psfs: Psfs | None = None,
+    area: DrawnArea | None = None,
 ) -> Exposures:
     """Return the lazy exposures of a pointings table, with the dims (exposure, y, x).
 
@@ -198,9 +196,15 @@ def exposures(
         Calibrations of the detectors, for the full detector model; None for the simple one.
     store : Store, optional
         Store that the tables of trapped charge of earlier exposures are read from; None to compute them.
+    psfs : Psfs, optional
+        PSFs of the exposures (see `psfs_for`); None to compute them.
+    area : DrawnArea, optional
+        Tiles for which parts of detectors are drawn; None to draw whole detectors, as for a detector model that cannot
+        draw a part.
     """
     ny, nx = instrument.shape
     readout = instrument.readout(seed, calibration)
+    psfs = psfs_for(instrument, table, calibration) if psfs is None else psfs
     common = {
         "render": render.model_dump(),
         "seed": seed,
@@ -210,6 +214,7 @@ def exposures(
         "psf": instrument.psf_settings,
         "readout": readout.settings,
     }
+    area = area if readout.draws_parts else None
     all_exposures = exposures_of(table)
     names = [exposure.name for exposure in all_exposures]
     corners = corners_of(table)
@@ -222,11 +227,15 @@ def exposures(
         exposure = all_exposures[row]
         return Unit(
             name=names[row],
-            settings={**common, "row": row, **vars(exposure), "earlier": [vars(all_exposures[k]) for k in earlier]},
-            inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure)])),
+            settings={
+                **common,
+                "row": row,
+                **vars(exposure),
+                "earlier": [vars(all_exposures[k]) for k in earlier],
+                "area": None if area is None else area.settings(row),
+            },
+            inputs=tuple(dict.fromkeys([*inputs, *earlier_inputs, *readout.inputs(exposure), *psfs.inputs(exposure)])),
             prerequisites=tuple(names[k] for k in earlier),
-            # exposures of the same detector and band share the PSFs in a worker's cache
-            affinity=f"{exposure.band}-{exposure.detector}",
         )
 
     axes = ("exposure",)
@@ -242,7 +251,15 @@ def exposures(
         }
 
     renderer = RenderExposure(
-        table=table, truth=truth, instrument=instrument, render=render, seed=seed, readout=readout, store=store
+        table=table,
+        truth=truth,
+        instrument=instrument,
+        render=render,
+        seed=seed,
+        readout=readout,
+        psfs=psfs,
+        area=area,
+        store=store,
     )
     image, *others = readout.variables
     noiseless = Variable(
@@ -250,7 +267,7 @@ def exposures(
         dtype="float32",
         shape=instrument.shape,
         axes=("y", "x"),
-        attributes={"units": "electron", "long_name": "noiseless image of the objects"},
+        attributes={**image.attributes, "long_name": "noiseless image of the objects"},
     )
     mesh = Variable(
         name="background_mesh",
@@ -270,12 +287,14 @@ def exposures(
         axes=axes,
         lengths=(len(table),),
         coordinates=coordinates,
-        attributes={"survey": instrument.name},
-        # image, truth, dq, background and working copies; the wide PSF of one node, while it is sampled or drawn; the
-        # objects, and the PSFs of two detectors or bands: the previous and the present ones
+        attributes={"survey": instrument.name, "area": "detector" if area is None else "region"},
+        # image, truth, dq, background and working copies; the wide PSF of one node, while it is read or drawn; the
+        # objects, and the PSFs of two detectors or bands: the previous ones, and the present ones while they are read
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
-        # sky, noise, detector effects and storage, then objects
-        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15),
+        # sky, noise, detector effects and storage, then objects; what is not drawn is still stored, as one value
+        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15)
+        if area is None
+        else ny * nx * (5e-8 + area.share(instrument.shape, instrument.pixel_scale) * readout.seconds_per_pixel),
         tables=readout.tables,
     )
     return Exposures(product=product, renderer=renderer)
@@ -331,7 +350,16 @@ def build_exposures(context: SurveyContext, survey: str) -> Exposures:
         pipeline.seed,
         calibration,
         context.store,
+        psfs_of(context, survey),
+        _area(context, survey) if pipeline.exposures.area == "region" else None,
     )
+
+
+def _area(context: SurveyContext, survey: str) -> DrawnArea:
+    """Return the area of the exposures of an instrument that the tiles of the survey need."""
+    settings, scale = context.pipeline.coadds, context.instruments[survey].coadd_scale
+    grid = settings.grid()
+    return drawn_area(context.pointings(survey), context.tiles, grid.side, grid.pixels(scale), scale)
 
 
 def has_exposures(context: SurveyContext, survey: str) -> bool:
@@ -344,7 +372,7 @@ EXPOSURES = Stage(
     per_survey=True,
     build=build_exposures,
     exists=has_exposures,
-    reads=("truth/galaxies", "truth/stars", "calibration"),
+    reads=("truth/galaxies", "truth/stars", "calibration", "psf_models"),
     units_known_after=UNITS_FROM_POINTINGS,
     unit="visit and detector",
     summary="Observed and noiseless images, rendered in Fourier space with the chromatic PSF at each position and read "

@@ -14,7 +14,7 @@ from astropy.wcs import WCS
 from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument, Readout
 from romandask.kernels.coadding.background import background_mesh
-from romandask.kernels.detectors.simple_detector import usable
+from romandask.kernels.detectors.simple_detector import WHOLE, usable
 from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
@@ -22,7 +22,9 @@ from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
 from romandask.products.tables import to_frame
+from romandask.stages.exposures.drawn_area import DrawnArea, Window
 from romandask.stages.pointings import corners_of
+from romandask.stages.psf_models import Psfs
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.manifest import read_record
 from romandask.storage.store import Store, read_parquet
@@ -31,6 +33,8 @@ REACH = 30.0
 """Distance from a detector within which galaxies are taken into account, arcsec."""
 STAR_REACH = 115.0
 """As REACH, for stars; it is larger because the diffraction spikes of bright stars are long."""
+_SKY_SAMPLE = slice(None, None, 32)
+"""Rows, and columns, of a detector from which the mean sky is taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +43,7 @@ class View:
 
     exposure: Exposure
     instrument: Instrument
+    psfs: Psfs
     render: RenderSettings
     header: dict[str, Any]
     """FITS header with the WCS."""
@@ -47,7 +52,9 @@ class View:
     drawable: Drawable
     """The objects that can be drawn."""
     background: np.ndarray
-    """Expected electrons that do not come from objects, shape (ny, nx)."""
+    """Expected electrons that do not come from objects, shape (ny, nx); 0 outside `window`."""
+    window: Window
+    """Rows and columns that are drawn."""
     faintest: float
     """Largest surface brightness at the edge of a stamp, electrons/pixel."""
     stamps: Stamps
@@ -63,6 +70,15 @@ class View:
         """Side of the stamp of each object, shape (n,), pixels; 0 for an object that is not drawn."""
         return self.stamps.size
 
+    @property
+    def shown(self) -> np.ndarray:
+        """True for the objects, shape (n,), whose stamps overlap the part of the detector that is drawn."""
+        shown, half = self.stamps.size > 0, self.stamps.size // 2
+        for part, side, position in zip(self.window, self.background.shape, (self.scene.y, self.scene.x), strict=True):
+            start, stop, _ = part.indices(side)
+            shown &= (position > start - half) & (position < stop - 1 + half)
+        return shown
+
     def expected(self, chosen: np.ndarray | None = None) -> np.ndarray:
         """Return the noiseless image of the objects, shape (ny, nx), electrons.
 
@@ -77,7 +93,7 @@ class View:
         if self.render.engine == "galsim":
             profiles = Profiles(instrument, exposure)
             return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
-        psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
+        psf, bright = self.psfs.model(exposure), self.psfs.bright(exposure)
         return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
 
     def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
@@ -98,6 +114,10 @@ class RenderExposure:
     """Seed of the survey."""
     readout: Readout
     """The detector model."""
+    psfs: Psfs
+    """PSFs of the exposures."""
+    area: DrawnArea | None = None
+    """Tiles for which parts of detectors are drawn; None to draw whole detectors."""
     store: Store | None = None
     """Store that the tables of earlier exposures are read from; without one they are computed."""
 
@@ -106,32 +126,39 @@ class RenderExposure:
         exposure, instrument = exposure_of(self.table.iloc[index]), self.instrument
         header = instrument.header(exposure)
         truth = self.truth.near(*cone(corners_of(self.table.iloc[[index]])[0]))
+        frame = WCS(header)
+        window = WHOLE if self.area is None else self.area.window(index, frame, instrument.shape)
         drawable = build_scene(
             truth,
-            WCS(header),
+            frame,
             instrument.bandpass(exposure.band),
             exposure.exptime,
             instrument.knot_smoothing,
             (instrument.shape, STAR_REACH / instrument.pixel_scale),
         )
-        background = instrument.background(exposure, header)
-        faintest = self.render.truncation * instrument.sky_noise(exposure, background)
+        background = np.zeros(instrument.shape, np.float32)
+        background[window] = instrument.background(exposure, header, *window)
+        # the mean sky of the whole detector, whatever part is drawn
+        sky = instrument.background(exposure, header, _SKY_SAMPLE, _SKY_SAMPLE)
+        faintest = self.render.truncation * instrument.sky_noise(exposure, sky)
         stamps = plan_stamps(
             drawable.scene,
-            instrument.psf_edges(exposure),
+            self.psfs.edges(exposure),
             instrument.shape,
             faintest,
             self.render.largest,
-            instrument.bright_psfs(exposure),
+            self.psfs.bright(exposure),
         )
         return View(
             exposure=exposure,
             instrument=instrument,
+            psfs=self.psfs,
             render=self.render,
             header=header,
             truth=truth,
             drawable=drawable,
             background=background,
+            window=window,
             faintest=faintest,
             stamps=stamps,
         )

@@ -38,4 +38,4 @@ def test_wide_nodes_return_the_same_transforms_at_every_call():
     nodes = WideNodes(sca=4, band="H158", waves=(1400.0, 1700.0), pupil_bin=8, grid=grid, diffusion=0.0)
     expected = transforms(4, "H158", np.array(nodes.waves), 8, MIDDLE, grid, 0.0)
     for _ in range(2):
-        np.testing.assert_array_equal(np.stack(list(nodes())), expected)
+        np.testing.assert_array_equal(np.stack(list(nodes)), expected)

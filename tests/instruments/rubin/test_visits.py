@@ -10,6 +10,7 @@ import pytest
 import sep
 
 from romandask.instruments.exposure import Exposure, footprint
+from romandask.instruments.psf_image import flat_shares, psf_image
 from romandask.instruments.rubin.psf import DEGREE
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.kernels.coadding.warp import REACH
@@ -28,7 +29,6 @@ from romandask.model.sky import Region
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.exposures.exposures import exposures
 from romandask.stages.pointings import CORNERS
-from romandask.stages.psf_images import flat_shares, psf_image
 from romandask.stages.truth.catalogs import truth
 
 SHAPE = (600, 616)

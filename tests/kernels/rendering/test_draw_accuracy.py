@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from romandask.instruments.exposure import Exposure
+from romandask.instruments.psf_image import flat_shares, psf_image
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering.draw import Scene, draw, plan_stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
 from romandask.kernels.rendering.galsim_engine import component_profile, object_profile
 from romandask.model.settings import RenderSettings
-from romandask.stages.psf_images import flat_shares, psf_image
 
 pytestmark = pytest.mark.slow
 

@@ -10,13 +10,13 @@ from astropy.wcs import WCS
 from drizzle.resample import Drizzle
 from scipy.special import erf
 
+from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.coadding.coadd_psf import drizzled_psf, native_star
 from romandask.kernels.coadding.drizzle import Sums
 from romandask.kernels.coadding.pixel_map import PixelMap, pixel_map
 from romandask.model.errors import UserError
 from romandask.stages.coadds.coadds import coadds
 from romandask.stages.coadds.psf_at import coadd_psf
-from romandask.stages.psf_images import flat_shares
 
 TURN = 1.9 * np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
 """Jacobian of the map from native pixels to tile pixels: 1.9 tile pixels per native pixel, rotated by 0.5 rad."""

@@ -19,9 +19,10 @@ import pandas as pd
 
 from romandask.instruments.exposure import Exposure, footprint
 from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
+from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.fourier import POINT
 from romandask.kernels.rendering.galsim_engine import object_profile
+from romandask.kernels.rendering.stamps import Scene, Stamps, plan_stamps
 from romandask.model.settings import RenderSettings, TruthSettings
 from romandask.model.sky import Region
 from romandask.stages.exposures.exposures import exposures

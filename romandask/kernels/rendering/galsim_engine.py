@@ -7,8 +7,8 @@ from collections.abc import Callable
 import galsim
 import numpy as np
 
-from romandask.kernels.rendering.draw import Scene, Stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, knot_offset
+from romandask.kernels.rendering.stamps import Scene, Stamps
 
 Cell = tuple[int, int]
 """Column and row of a cell of the detector; all objects in a cell are drawn with the same PSFs."""

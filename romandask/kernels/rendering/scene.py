@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
+from romandask.kernels.rendering.stamps import Scene
 from romandask.kernels.universe.dust import Dust, no_dust
 from romandask.kernels.universe.synthetic_photometry import Spectra, node_photons
 from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -15,9 +15,10 @@ from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument, Readout
 from romandask.kernels.coadding.background import background_mesh
 from romandask.kernels.detectors.simple_detector import usable
-from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
+from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
+from romandask.kernels.rendering.stamps import Scene, Stamps, plan_stamps
 from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
@@ -73,7 +74,7 @@ class View:
         """
         instrument, exposure, stamps = self.instrument, self.exposure, self.stamps
         if chosen is not None:
-            stamps = replace(stamps, size=np.where(chosen, stamps.size, 0))
+            stamps = stamps.only(chosen)
         if self.render.engine == "galsim":
             profiles = Profiles(instrument, exposure)
             return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)

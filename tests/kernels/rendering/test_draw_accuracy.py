@@ -10,9 +10,10 @@ import pytest
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.roman import Roman, RomanSettings
-from romandask.kernels.rendering.draw import Scene, draw, plan_stamps
+from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
 from romandask.kernels.rendering.galsim_engine import component_profile, object_profile
+from romandask.kernels.rendering.stamps import Scene, plan_stamps
 from romandask.model.settings import RenderSettings
 from romandask.stages.psf_images import flat_shares, psf_image
 

@@ -94,7 +94,7 @@ class Pyramid:
         light : array, shape (n,), electrons
             Light of the whole components.
         side : int array, shape (n,), pixels
-            Sides of the squares, powers of two.
+            Sides of the squares, powers of two. Their first pixels are floor(x) - side / 2, floor(y) - side / 2.
         extent : array, shape (n,), pixels
             Radii beyond which light is not drawn.
         """
@@ -147,8 +147,9 @@ def _add_points(values, starts, shapes, x, y, light, cells):
 @numba.njit(nogil=True, cache=True)
 def _add_galaxies(values, starts, shapes, x, y, kind, matrix, light, side, extent, tables):
     """Add the light of galaxies outside squares; see `Pyramid.add_galaxies`."""
-    across, offset = np.empty(2 * REACH + 1), np.empty(2 * REACH + 1)
-    across_inner = np.empty(2 * REACH + 1)
+    most = 2 * REACH + 4
+    across, up = np.empty((most, 2)), np.empty((most, 2))
+    column, row = np.empty(most, np.int64), np.empty(most, np.int64)
     for n in range(x.shape[0]):
         m = matrix[n]
         xx, yy = m[0, 0] ** 2 + m[0, 1] ** 2, m[1, 0] ** 2 + m[1, 1] ** 2
@@ -162,34 +163,59 @@ def _add_galaxies(values, starts, shapes, x, y, kind, matrix, light, side, exten
             if inner / 2 > extent[n]:
                 break
             cell = FIRST_CELL << k
-            rows, columns = shapes[k, 0], shapes[k, 1]
-            i, j = int(np.floor((x[n] + 0.5) / cell)), int(np.floor((y[n] + 0.5) / cell))
-            left, low = i + _MARGIN - REACH, j + _MARGIN - REACH
-            begin, end = max(0, -left), min(2 * REACH + 1, columns - left)
-            for a in range(begin, end):
-                offset[a] = (i - REACH + a + 0.5) * cell - (x[n] + 0.5)
-                across[a] = _overlap(offset[a], cell, inner)
-                across_inner[a] = _overlap(offset[a], cell, inner / 2)
-            scale, step = light[n] / area / 4 / cell**2, _GAUSS * cell
-            for b in range(max(0, -low), min(2 * REACH + 1, rows - low)):
-                dy = (j - REACH + b + 0.5) * cell - (y[n] + 0.5)
-                up, up_inner = _overlap(dy, cell, inner), _overlap(dy, cell, inner / 2)
-                first = starts[k] + (low + b) * columns + left
-                for a in range(begin, end):
-                    covered = across[a] * up - across_inner[a] * up_inner
-                    if covered > 0:
-                        total = 0.0
-                        for q in range(4):
-                            dx, dz = offset[a] + (2 * (q % 2) - 1) * step, dy + (2 * (q // 2) - 1) * step
-                            square = ixx * dx * dx + 2 * ixy * dx * dz + iyy * dz * dz
-                            total += surface_brightness(tables, kind[n], square)
-                        values[first + a] += np.float32(scale * covered * total)
+            # the first ring begins at the edges of the stamp, whose middle is not quite the object
+            shift = 0.5 if inner == side[n] else 0.0
+            left, low = -shift * (1 + 2 * (x[n] - np.floor(x[n]))), -shift * (1 + 2 * (y[n] - np.floor(y[n])))
+            columns = _pieces(x[n] + 0.5, cell, inner, left, shapes[k, 1], column, across)
+            rows = _pieces(y[n] + 0.5, cell, inner, low, shapes[k, 0], row, up)
+            scale = light[n] / area / 4 / cell**2
+            for b in range(rows):
+                dy, height = up[b]
+                within = abs(dy - low) < inner / 2
+                first = starts[k] + row[b] * shapes[k, 1]
+                for a in range(columns):
+                    dx, width = across[a]
+                    if within and abs(dx - left) < inner / 2:
+                        continue
+                    total = 0.0
+                    for q in range(4):
+                        u, v = dx + (2 * (q % 2) - 1) * _GAUSS * width, dy + (2 * (q // 2) - 1) * _GAUSS * height
+                        square = ixx * u * u + 2 * ixy * u * v + iyy * v * v
+                        total += surface_brightness(tables, kind[n], square)
+                    values[first + column[a]] += np.float32(scale * width * height * total)
 
 
 @numba.njit(nogil=True, cache=True)
-def _overlap(middle, width, half):
-    """Return the length, on one axis, of an interval of some middle and width within -half to half."""
-    return max(0.0, min(middle + width / 2, half) - max(middle - width / 2, -half))
+def _pieces(position, cell, inner, shift, count, number, piece):
+    """Split the cells of a ring along one axis at the edges of the ring, and return the number of pieces in the grid.
+
+    Parameters
+    ----------
+    position : float, pixels
+        Position of the object, from the edge of the image.
+    cell, inner : int, pixels
+        Side of the cells, and inner side of the ring.
+    shift : float, pixels
+        Middle of the inner square, from the object.
+    count : int
+        Number of cells of the grid.
+    number, piece : array, shape (n,) and (n, 2)
+        Output: cell in the grid of each piece; middle, from the object, and width of each piece, pixels.
+    """
+    pieces = 0
+    middle = int(np.floor(position / cell))
+    for k in range(middle - REACH, middle + REACH + 1):
+        if k + _MARGIN < 0 or k + _MARGIN >= count:
+            continue
+        start, stop = max(k * cell - position, -float(inner)), min((k + 1) * cell - position, float(inner))
+        for edge in (shift - inner / 2, shift + inner / 2, stop):
+            end = min(max(edge, start), stop)
+            if end > start:
+                number[pieces] = k + _MARGIN
+                piece[pieces] = ((start + end) / 2, end - start)
+                pieces += 1
+                start = end
+    return pieces
 
 
 @numba.njit(nogil=True, cache=True)
@@ -220,9 +246,9 @@ def add_galaxy_pixels(image, x, y, kind, matrix, light, side, x0, y0, stamp, tab
     xy = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1]
     area = np.sqrt(max(xx * yy - xy * xy, 1e-30))
     ixx, ixy, iyy = yy / area**2, -xy / area**2, xx / area**2
-    for j in range(max(0, int(np.ceil(y - side / 2))), min(ny, int(np.ceil(y + side / 2)))):
+    for j in range(max(0, int(np.floor(y)) - side // 2), min(ny, int(np.floor(y)) + side // 2)):
         dy = j - y
-        for i in range(max(0, int(np.ceil(x - side / 2))), min(nx, int(np.ceil(x + side / 2)))):
+        for i in range(max(0, int(np.floor(x)) - side // 2), min(nx, int(np.floor(x)) + side // 2)):
             if x0 <= i < x0 + stamp and y0 <= j < y0 + stamp:
                 continue
             dx = i - x

@@ -16,8 +16,8 @@ def add_wings(
     radii: tuple[np.ndarray, np.ndarray],
     rings: Rings,
     stamps: Stamps,
-    missing: np.ndarray,
-    ends: np.ndarray,
+    missing: np.ndarray | None = None,
+    ends: np.ndarray | None = None,
 ) -> None:
     """Add the light of objects outside their stamps to an image.
 
@@ -34,12 +34,14 @@ def add_wings(
         Rings of the PSF.
     stamps : Stamps
         Stamps of the objects.
-    missing : array, shape (n,), electrons
-        Light that the PSF scatters out of the stamp of each object; NaN for what `rings` says.
-    ends : int array, shape (n,), pixels
-        Side of the PSF of each object.
+    missing : array, shape (n,), electrons, optional
+        Light that the PSF scatters out of the stamp of each object; by default, and where NaN, that of `rings`.
+    ends : int array, shape (n,), pixels, optional
+        Side of the PSF of each object with a bright-star PSF; by default that of the stamp.
     """
     grids = pyramid(image.shape)
+    missing = np.full(len(scene.x), np.nan) if missing is None else missing
+    ends = stamps.inside if ends is None else ends
     lit = np.flatnonzero(stamps.inside)
     photons = np.stack([np.bincount(scene.owner, node, minlength=len(scene.x))[lit] for node in scene.photons.T], 1)
     x, y, missing, side = scene.x[lit], scene.y[lit], missing[lit], stamps.inside[lit]

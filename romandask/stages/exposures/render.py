@@ -18,7 +18,8 @@ from romandask.kernels.detectors.simple_detector import usable
 from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.galsim_engine import draw_objects
 from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
-from romandask.kernels.rendering.stamps import Scene, Stamps, plan_stamps
+from romandask.kernels.rendering.stamps import Scene, Stamps, component_extents, component_radii, plan_stamps
+from romandask.kernels.rendering.wings import add_wings
 from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
@@ -75,11 +76,14 @@ class View:
         instrument, exposure, stamps = self.instrument, self.exposure, self.stamps
         if chosen is not None:
             stamps = stamps.only(chosen)
+        psf = instrument.psf(exposure)
         if self.render.engine == "galsim":
             profiles = Profiles(instrument, exposure)
-            return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
-        psf, bright = instrument.psf(exposure), instrument.bright_psfs(exposure)
-        return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
+            image = draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
+            radii = component_extents(self.scene), component_radii(self.scene, self.faintest)
+            add_wings(image, self.scene, radii, psf.rings, stamps)
+            return image
+        return draw(self.scene, psf, instrument.shape, stamps, self.faintest, instrument.bright_psfs(exposure))
 
     def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
         """Return the cell of a position on the detector, and GalSim's PSFs there, one per PSF node."""

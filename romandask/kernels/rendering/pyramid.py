@@ -20,6 +20,10 @@ LEVELS = 10
 """Number of grids; the last one holds the light from 8192 to 16384 pixels around an object."""
 _MARGIN = 2
 """Cells of each grid beyond each edge of the image."""
+_LARGE = 128
+"""Side of the stamps, pixels, of galaxies whose wings are in finer cells."""
+_FINER = 2
+"""Grids between that of the ring and that of the finer cells."""
 _GAUSS = 0.5 / np.sqrt(3.0)
 """Distance of the points of a two-point quadrature from the middle of a cell, in cells."""
 
@@ -147,7 +151,7 @@ def _add_points(values, starts, shapes, x, y, light, cells):
 @numba.njit(nogil=True, cache=True)
 def _add_galaxies(values, starts, shapes, x, y, kind, matrix, light, side, extent, tables):
     """Add the light of galaxies outside squares; see `Pyramid.add_galaxies`."""
-    most = 2 * REACH + 4
+    most = 2 * (REACH << _FINER) + 4
     across, up = np.empty((most, 2)), np.empty((most, 2))
     column, row = np.empty(most, np.int64), np.empty(most, np.int64)
     for n in range(x.shape[0]):
@@ -162,39 +166,47 @@ def _add_galaxies(values, starts, shapes, x, y, kind, matrix, light, side, exten
                 continue
             if inner / 2 > extent[n]:
                 break
-            cell = FIRST_CELL << k
+            # the wings of large galaxies are far above those of others
+            finer = _FINER if side[n] >= _LARGE else 0
+            cell, grid, reach = FIRST_CELL << (k - finer), k - finer, REACH << finer
             # the first ring begins at the edges of the stamp, whose middle is not quite the object
             shift = 0.5 if inner == side[n] else 0.0
             left, low = -shift * (1 + 2 * (x[n] - np.floor(x[n]))), -shift * (1 + 2 * (y[n] - np.floor(y[n])))
-            columns = _pieces(x[n] + 0.5, cell, inner, left, shapes[k, 1], column, across)
-            rows = _pieces(y[n] + 0.5, cell, inner, low, shapes[k, 0], row, up)
-            scale = light[n] / area / 4 / cell**2
+            columns = _pieces(x[n] + 0.5, cell, reach, inner, left, shapes[grid, 1], column, across)
+            rows = _pieces(y[n] + 0.5, cell, reach, inner, low, shapes[grid, 0], row, up)
+            # the first ring has most of the light, and the steepest profile
+            points = 4 if inner == side[n] else 1
+            scale, step = light[n] / area / points / cell**2, _GAUSS if points > 1 else 0.0
             for b in range(rows):
                 dy, height = up[b]
                 within = abs(dy - low) < inner / 2
-                first = starts[k] + row[b] * shapes[k, 1]
+                first = starts[grid] + row[b] * shapes[grid, 1]
                 for a in range(columns):
                     dx, width = across[a]
                     if within and abs(dx - left) < inner / 2:
                         continue
                     total = 0.0
-                    for q in range(4):
-                        u, v = dx + (2 * (q % 2) - 1) * _GAUSS * width, dy + (2 * (q // 2) - 1) * _GAUSS * height
+                    for q in range(points):
+                        u, v = dx + (2 * (q % 2) - 1) * step * width, dy + (2 * (q // 2) - 1) * step * height
                         square = ixx * u * u + 2 * ixy * u * v + iyy * v * v
                         total += surface_brightness(tables, kind[n], square)
                     values[first + column[a]] += np.float32(scale * width * height * total)
 
 
 @numba.njit(nogil=True, cache=True)
-def _pieces(position, cell, inner, shift, count, number, piece):
+def _pieces(position, cell, reach, inner, shift, count, number, piece):
     """Split the cells of a ring along one axis at the edges of the ring, and return the number of pieces in the grid.
 
     Parameters
     ----------
     position : float, pixels
         Position of the object, from the edge of the image.
-    cell, inner : int, pixels
-        Side of the cells, and inner side of the ring.
+    cell : int, pixels
+        Side of the cells.
+    reach : int
+        Cells from the object to the outer edge of the ring.
+    inner : int, pixels
+        Inner side of the ring.
     shift : float, pixels
         Middle of the inner square, from the object.
     count : int
@@ -204,7 +216,7 @@ def _pieces(position, cell, inner, shift, count, number, piece):
     """
     pieces = 0
     middle = int(np.floor(position / cell))
-    for k in range(middle - REACH, middle + REACH + 1):
+    for k in range(middle - reach, middle + reach + 1):
         if k + _MARGIN < 0 or k + _MARGIN >= count:
             continue
         start, stop = max(k * cell - position, -float(inner)), min((k + 1) * cell - position, float(inner))

@@ -17,7 +17,7 @@ from romandask.kernels.coadding.background import background_mesh
 from romandask.kernels.detectors.simple_detector import usable
 from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.galsim_engine import draw_objects
-from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
+from romandask.kernels.rendering.scene import Drawable, Truth, Within, build_scene
 from romandask.kernels.rendering.stamps import Scene, Stamps, component_extents, component_radii, plan_stamps
 from romandask.kernels.rendering.wings import add_wings
 from romandask.model.settings import RenderSettings
@@ -117,7 +117,7 @@ class RenderExposure:
             instrument.bandpass(exposure.band),
             exposure.exptime,
             instrument.knot_smoothing,
-            (instrument.shape, STAR_REACH / instrument.pixel_scale),
+            Within(instrument.shape, REACH / instrument.pixel_scale, STAR_REACH / instrument.pixel_scale),
         )
         background = instrument.background(exposure, header)
         faintest = self.render.truncation * instrument.sky_noise(exposure, background)

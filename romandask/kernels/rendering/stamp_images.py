@@ -12,7 +12,7 @@ _COARSE_POINTS, _DENSE_POINTS = 9, 33
 beyond the edges of their stamps."""
 _GAUSS = 1 / np.sqrt(3.0)
 """Distance between the points of a two-point quadrature, in units of the interval."""
-_MAX_PERIODS = 24
+_MAX_PERIODS = 64
 """Distance of the outermost periodic images that are subtracted, in periods."""
 
 

@@ -275,7 +275,7 @@ def exposures(
         # objects, and the PSFs of two detectors or bands: the previous and the present ones
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
         # sky, noise, detector effects and storage, then objects
-        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15),
+        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.07),
         tables=readout.tables,
     )
     return Exposures(product=product, renderer=renderer)

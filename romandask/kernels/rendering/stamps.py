@@ -21,6 +21,8 @@ from romandask.kernels.rendering.rings import FIRST_SIDE
 
 MIN_STAMP = FIRST_SIDE
 """Side of the smallest stamps, pixels."""
+_LEAST_RADIUS = 1.2
+"""Radius, in half-light radii, of the part of a galaxy that its stamp contains, however faint it is."""
 _TAIL = 2e-4
 """Fraction of the light of an object that may lie beyond the extent of each of its components."""
 
@@ -132,7 +134,9 @@ def stamp_sizes(scene: Scene, edges: dict[int, float], faintest: float, largest:
         Sides of the stamps.
     """
     radius = np.zeros(len(scene.x))
-    np.maximum.at(radius, scene.owner, component_radii(scene, faintest))
+    # the PSF scatters out of the stamp as if the light were in the middle
+    least = _LEAST_RADIUS * major_axes(scene) * (scene.photons.sum(axis=1) > 0)
+    np.maximum.at(radius, scene.owner, np.maximum(component_radii(scene, faintest), least))
     flux = scene.fluxes()
     size = np.full(len(scene.x), MIN_STAMP)
     while True:

@@ -21,6 +21,9 @@ from romandask.kernels.rendering.rings import FIRST_SIDE
 
 MIN_STAMP = FIRST_SIDE
 """Side of the smallest stamps, pixels."""
+_SMALLEST_SHARE = 0.25
+"""Surface brightness at the edges of the smallest stamps, in units of that at others: they are for objects that no
+image shows one by one, because wings that begin so near the middle change the size of an object by half a per cent."""
 _LEAST_RADIUS = 1.2
 """Radius, in half-light radii, of the part of a galaxy that its stamp contains, however faint it is."""
 _TAIL = 2e-4
@@ -140,7 +143,8 @@ def stamp_sizes(scene: Scene, edges: dict[int, float], faintest: float, largest:
     flux = scene.fluxes()
     size = np.full(len(scene.x), MIN_STAMP)
     while True:
-        grow = (radius > size / 2 - np.minimum(size / 4, 6)) | (flux * _edge(edges, size) > faintest)
+        limit = np.where(size > MIN_STAMP, faintest, _SMALLEST_SHARE * faintest)
+        grow = (radius > size / 2 - np.minimum(size / 4, 6)) | (flux * _edge(edges, size) > limit)
         grow &= size < largest
         if not grow.any():
             return size

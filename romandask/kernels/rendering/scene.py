@@ -273,7 +273,8 @@ def build_scene(
     has_position = np.isfinite(x) & np.isfinite(y) & np.isfinite(to_pixels).all(axis=(1, 2))
     reasons[~has_position] = NO_POSITION
     if within is not None:
-        scale = np.sqrt(np.abs(np.linalg.det(to_pixels)))
+        with np.errstate(invalid="ignore"):
+            scale = np.sqrt(np.abs(np.linalg.det(to_pixels)))
         near = within.contains(x, y, np.r_[_radii(galaxies), np.zeros(len(stars))] * scale, np.arange(len(x)) >= n)
         reasons[has_position & ~near & (reasons == DRAWN)] = OFF_IMAGE
     kept = np.flatnonzero(reasons == DRAWN)

@@ -15,8 +15,8 @@ import pandas as pd
 import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
-from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.galsim_engine import Cell
+from romandask.kernels.rendering.stamps import Scene
 from romandask.storage.arrays import Variable
 
 

@@ -30,7 +30,7 @@ class SimpleReadout:
     """Shape of the detector (ny, nx), pixels."""
     seed: int
     """Seed of the survey."""
-    seconds_per_pixel: float = 2.5e-7
+    seconds_per_pixel: float = 1.0e-7
     draws_parts: bool = True
 
     @property

@@ -33,7 +33,7 @@ def truth_index(exposures: Exposures) -> TableProduct:
         make=MakeIndex(renderer),
         schema=schema("truth_index"),
         bytes_per_unit=int(np.prod(renderer.instrument.shape)) * 16 + (520 << 20),
-        seconds_per_unit=1.2,
+        seconds_per_unit=0.9,
     )
 
 

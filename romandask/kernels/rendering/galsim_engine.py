@@ -7,11 +7,13 @@ from collections.abc import Callable
 import galsim
 import numpy as np
 
-from romandask.kernels.rendering.draw import Scene, Stamps
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, knot_offset
+from romandask.kernels.rendering.stamps import Scene, Stamps
 
 Cell = tuple[int, int]
 """Column and row of a cell of the detector; all objects in a cell are drawn with the same PSFs."""
+_BORDER = 96
+"""Pixels that are drawn around a stamp, at least, and cut off."""
 MIN_FLUX_FRACTION = 1e-9
 """Components with a smaller fraction of the flux of an object are not drawn."""
 
@@ -35,7 +37,7 @@ def draw_objects(
     shape : (int, int)
         Shape of the image (ny, nx).
     stamps : Stamps
-        Sizes of the stamps; objects of size 0 are not drawn.
+        Sizes of the stamps; objects of size 0 are not drawn. Light outside the stamps is added by `add_wings`.
     pixel_scale : float, arcsec
         Pixel scale.
 
@@ -54,8 +56,12 @@ def draw_objects(
         size = int(stamps.size[n])
         x0, y0 = int(np.floor(scene.x[n])) - size // 2, int(np.floor(scene.y[n])) - size // 2
         bounds = galsim.BoundsI(x0, x0 + size - 1, y0, y0 + size - 1)
+        # GalSim folds what lies beyond the edge of a drawn image into the image
         stamp = profile.drawImage(
-            bounds=bounds, scale=1.0, center=galsim.PositionD(scene.x[n], scene.y[n]), dtype=float
+            bounds=bounds.withBorder(max(size // 2, _BORDER)),
+            scale=1.0,
+            center=galsim.PositionD(scene.x[n], scene.y[n]),
+            dtype=float,
         )
         part = bounds & image.bounds
         if part.isDefined():

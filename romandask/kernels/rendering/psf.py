@@ -15,6 +15,7 @@ from numpy.polynomial.chebyshev import chebvander
 from scipy import fft
 
 from romandask.kernels.rendering.fourier import Frequencies, pack_frequencies
+from romandask.kernels.rendering.rings import Rings, rings
 
 _MIN_MODE_PEAK = 1e-7
 """Surface brightness of a unit star, 1/pixel, below which a mode of the PSF's variation is left out."""
@@ -165,6 +166,13 @@ class PsfModel:
     def _images(self) -> np.ndarray:
         """Images of the modes, oversampled by core.folds."""
         return np.stack([star_image(mode, self.core, self.core.folds) for mode in self.modes])
+
+    @cached_property
+    def rings(self) -> Rings:
+        """Light outside small stamps, for the PSFs in the middle of the detector."""
+        return rings(
+            [star_image(node, self.grid, self.grid.folds) for node in self.nodes], self.grid.folds, self.grid.size
+        )
 
     @cached_property
     def edges(self) -> dict[int, float]:

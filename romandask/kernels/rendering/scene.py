@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 from astropy.wcs import WCS
 
-from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT
+from romandask.kernels.rendering.profiles import light_radius
+from romandask.kernels.rendering.stamps import Scene
 from romandask.kernels.universe.dust import Dust, no_dust
 from romandask.kernels.universe.synthetic_photometry import Spectra, node_photons
 from romandask.model.spectra import Bandpass, LibrarySpectra, SpectrumLibrary, TophatSpectra
@@ -208,13 +209,41 @@ class Drawable:
     """Pixel coordinate along y, as `x`."""
 
 
+@dataclass(frozen=True)
+class Within:
+    """Distances from an image to which objects are kept."""
+
+    shape: tuple[int, int]
+    """Shape of the image (ny, nx)."""
+    galaxies: float
+    """Distance for galaxies, pixels; larger ones are kept as far as their light reaches."""
+    stars: float
+    """Distance for stars, pixels."""
+
+    def contains(self, x: np.ndarray, y: np.ndarray, radius: np.ndarray, is_star: np.ndarray) -> np.ndarray:
+        """Return a mask of the objects to keep, given their positions and radii, pixels, and whether they are stars."""
+        (ny, nx), distance = self.shape, np.where(is_star, self.stars, np.fmax(self.galaxies, radius))
+        with np.errstate(invalid="ignore"):
+            return (x > -distance) & (x < nx + distance) & (y > -distance) & (y < ny + distance)
+
+
+def _radii(galaxies: pd.DataFrame) -> np.ndarray:
+    """Return radii, arcsec, that contain all but a thousandth of the light of galaxies."""
+    radii = [np.zeros(len(galaxies))]
+    for component, kind, size in (("bulge", DEVAUCOULEURS, "bulge"), ("disk", EXPONENTIAL, "disk")):
+        lit = np.isfinite(galaxies[f"{component}_magnorm"].to_numpy(float))
+        extent = light_radius(np.array([kind]), np.array([1e-3]))[0]
+        radii.append(np.where(lit, extent * galaxies[f"size_{size}_true"].to_numpy(float), 0.0))
+    return np.fmax.reduce(radii)
+
+
 def build_scene(
     truth: Truth,
     wcs: WCS,
     bandpass: Bandpass,
     exptime: float,
     knot_smoothing: float,
-    within: tuple[tuple[int, int], float] | None = None,
+    within: Within | None = None,
 ) -> Drawable:
     """Return the scene of an image.
 
@@ -232,8 +261,8 @@ def build_scene(
         Exposure time; electrons are photon rates times this.
     knot_smoothing : float, arcsec
         Sigma of the Gaussian that smooths each knot before lensing; 0 for no smoothing.
-    within : ((int, int), float), optional
-        Shape of the image (ny, nx), and the distance from it, pixels, to which objects are kept; None to keep all.
+    within : Within, optional
+        Where objects are kept; None to keep all.
     """
     galaxies, stars = truth.galaxies, truth.stars
     n = len(galaxies)
@@ -244,9 +273,9 @@ def build_scene(
     has_position = np.isfinite(x) & np.isfinite(y) & np.isfinite(to_pixels).all(axis=(1, 2))
     reasons[~has_position] = NO_POSITION
     if within is not None:
-        (ny, nx), distance = within
         with np.errstate(invalid="ignore"):
-            near = (x > -distance) & (x < nx + distance) & (y > -distance) & (y < ny + distance)
+            scale = np.sqrt(np.abs(np.linalg.det(to_pixels)))
+        near = within.contains(x, y, np.r_[_radii(galaxies), np.zeros(len(stars))] * scale, np.arange(len(x)) >= n)
         reasons[has_position & ~near & (reasons == DRAWN)] = OFF_IMAGE
     kept = np.flatnonzero(reasons == DRAWN)
     truth = _rows_of(truth, kept[kept < n], kept[kept >= n] - n)

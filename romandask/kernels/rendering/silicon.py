@@ -7,8 +7,8 @@ from collections.abc import Callable
 import galsim
 import numpy as np
 
-from romandask.kernels.rendering.draw import Scene
 from romandask.kernels.rendering.galsim_engine import Cell, component_profile
+from romandask.kernels.rendering.stamps import Scene
 
 MIN_ELECTRONS = 5e4
 """Smallest flux, electrons, of objects drawn with the silicon model; the brightest pixel of such a star has some

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from romandask.kernels.universe.dust import ALL_DUST, Dust, av_and_ebv, extinction_curve
+from romandask.kernels.universe.dust import ALL_DUST, INTERNAL_DUST, NO_DUST, Dust, av_and_ebv, extinction_curve
 from romandask.kernels.universe.photon_integrals import library_rates, tophat_rates
 from romandask.model.spectra import (
     LOG_STEP,
@@ -66,7 +66,8 @@ def node_photons(
     shares = bandpass.node_weights() * bandpass.weights[:, None]
     nodes = [(k, np.flatnonzero(shares[:, k] > 0)) for k in range(shares.shape[1])]
     rows = [(bandpass.first + used[0], shares[used[0] : used[-1] + 1, k]) for k, used in nodes]
-    return _rates(magnorm, spectra, redshift, internal, milky_way, _channels(rows), internal_frame)[ALL_DUST]
+    channels = _channels(rows)
+    return _rates(magnorm, spectra, redshift, internal, milky_way, channels, internal_frame, (ALL_DUST,))[0]
 
 
 def band_photons(
@@ -139,8 +140,9 @@ def _rates(
     milky_way: Dust,
     channels: _Channels,
     internal_frame: str,
+    dust: tuple[int, ...] = (ALL_DUST, INTERNAL_DUST, NO_DUST),
 ) -> np.ndarray:
-    """Return the photon rates, shape (3, n, channels), of `band_photons`."""
+    """Return the photon rates, shape (dust, n, channels), of `band_photons`, for every `dust` or ALL_DUST alone."""
     magnorm = np.asarray(magnorm, float)
     n = len(magnorm)
     lit = np.isfinite(magnorm)
@@ -152,7 +154,7 @@ def _rates(
     internal_wave = _rest_frame_wave() if rest_frame else channels.wave
     milky_way_av_ebv = av_and_ebv(milky_way, "F19")
     internal_av_ebv = av_and_ebv(internal, "CCM")
-    out = np.zeros((3, n, len(channels.starts)))
+    out = np.zeros((len(dust), n, len(channels.starts)))
     common = (
         scale,
         shift,

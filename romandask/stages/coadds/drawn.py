@@ -10,10 +10,11 @@ from romandask.instruments.exposure import exposure_of
 from romandask.instruments.psf_image import flat_shares
 from romandask.kernels.coadding.background import subtract_background
 from romandask.kernels.coadding.stack import stack
-from romandask.kernels.rendering.draw import Scene, draw, draw_wide, plan_stamps
+from romandask.kernels.rendering.draw import draw, draw_wide
 from romandask.kernels.rendering.fourier import POINT
 from romandask.kernels.rendering.psf import PsfModel
 from romandask.kernels.rendering.scene import build_scene
+from romandask.kernels.rendering.stamps import Scene, plan_stamps
 from romandask.model.seeds import realisation_key, rng
 from romandask.model.spectra import NJY_ZERO_POINT, Bandpass
 from romandask.stages.coadds.input_psfs import psf_side

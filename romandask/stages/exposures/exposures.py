@@ -292,7 +292,7 @@ def exposures(
         # objects, and the PSFs of two detectors or bands: the previous ones, and the present ones while they are read
         bytes_per_unit=ny * nx * 28 + 110 * render.largest**2 + (440 << 20),
         # sky, noise, detector effects and storage, then objects; what is not drawn is still stored, as one value
-        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.15)
+        seconds_per_unit=ny * nx * (readout.seconds_per_pixel + instrument.pixel_scale**2 / 3600 * 0.07)
         if area is None
         else ny * nx * (5e-8 + area.share(instrument.shape, instrument.pixel_scale) * readout.seconds_per_pixel),
         tables=readout.tables,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -15,9 +15,11 @@ from romandask.instruments.exposure import Exposure, exposure_of
 from romandask.instruments.instrument import Instrument, Readout
 from romandask.kernels.coadding.background import background_mesh
 from romandask.kernels.detectors.simple_detector import WHOLE, usable
-from romandask.kernels.rendering.draw import Scene, Stamps, draw, plan_stamps
+from romandask.kernels.rendering.draw import draw
 from romandask.kernels.rendering.galsim_engine import draw_objects
-from romandask.kernels.rendering.scene import Drawable, Truth, build_scene
+from romandask.kernels.rendering.scene import Drawable, Truth, Within, build_scene
+from romandask.kernels.rendering.stamps import Scene, Stamps, component_extents, component_radii, plan_stamps
+from romandask.kernels.rendering.wings import add_wings
 from romandask.model.settings import RenderSettings
 from romandask.model.sky import radec, unit_vectors
 from romandask.products.images import table_beside
@@ -89,12 +91,15 @@ class View:
         """
         instrument, exposure, stamps = self.instrument, self.exposure, self.stamps
         if chosen is not None:
-            stamps = replace(stamps, size=np.where(chosen, stamps.size, 0))
+            stamps = stamps.only(chosen)
+        psf = self.psfs.model(exposure)
         if self.render.engine == "galsim":
             profiles = Profiles(instrument, exposure)
-            return draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
-        psf, bright = self.psfs.model(exposure), self.psfs.bright(exposure)
-        return draw(self.scene, psf, instrument.shape, stamps, self.faintest, bright)
+            image = draw_objects(self.scene, profiles, instrument.shape, stamps, instrument.pixel_scale)
+            radii = component_extents(self.scene), component_radii(self.scene, self.faintest)
+            add_wings(image, self.scene, radii, psf.rings, stamps)
+            return image
+        return draw(self.scene, psf, instrument.shape, stamps, self.faintest, self.psfs.bright(exposure))
 
     def profiles(self, x: float, y: float) -> tuple[Any, list[galsim.GSObject]]:
         """Return the cell of a position on the detector, and GalSim's PSFs there, one per PSF node."""
@@ -134,7 +139,7 @@ class RenderExposure:
             instrument.bandpass(exposure.band),
             exposure.exptime,
             instrument.knot_smoothing,
-            (instrument.shape, STAR_REACH / instrument.pixel_scale),
+            Within(instrument.shape, REACH / instrument.pixel_scale, STAR_REACH / instrument.pixel_scale),
         )
         background = np.zeros(instrument.shape, np.float32)
         background[window] = instrument.background(exposure, header, *window)

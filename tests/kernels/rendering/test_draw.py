@@ -11,11 +11,11 @@ from romandask.ingest.spectra import galaxy_templates
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.roman.roman import Roman, RomanSettings
 from romandask.kernels.rendering import draw as render
-from romandask.kernels.rendering.draw import Scene, plan_stamps, stamp_sizes
 from romandask.kernels.rendering.fourier import DEVAUCOULEURS, EXPONENTIAL, KNOTS, POINT, knot_offset
 from romandask.kernels.rendering.galsim_sampling import sample_model
 from romandask.kernels.rendering.scene import bind, build_scene, magnification, pixel_positions, shape_matrices
 from romandask.kernels.rendering.seeing import kolmogorov_transfer, radial_model
+from romandask.kernels.rendering.stamps import Scene, plan_stamps, stamp_sizes
 from romandask.model.tiles import tangent_header
 
 SHARES = np.array([0.2, 0.5, 0.3])

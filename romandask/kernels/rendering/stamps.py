@@ -26,6 +26,8 @@ _SMALLEST_SHARE = 0.25
 image shows one by one, because wings that begin so near the middle change the size of an object by half a per cent."""
 _LEAST_RADIUS = 1.2
 """Radius, in half-light radii, of the part of a galaxy that its stamp contains, however faint it is."""
+_MEASURABLE_FLUX = 1000
+"""Flux, in units of `faintest`, above which the stamps of galaxies contain all but a thousandth of a disk."""
 _TAIL = 2e-4
 """Fraction of the light of an object that may lie beyond the extent of each of its components."""
 
@@ -188,6 +190,11 @@ def component_radii(scene: Scene, faintest: float) -> np.ndarray:
         disk = np.log(flux / (2 * np.pi * EXPONENTIAL_RADIUS**2 * area * faintest)) * EXPONENTIAL_RADIUS
         bulge = (1 + np.maximum(np.log(flux / (22.67 * area * faintest)) / 7.669, -1)) ** 4
     radius = np.where(scene.kind == EXPONENTIAL, disk, np.where(scene.kind == DEVAUCOULEURS, bulge, 0.0))
+    # light beyond a stamp is drawn on coarse grids, on which the moments of its pixels are not kept: for objects bright
+    # enough to be measured, at most a thousandth of the light may lie there
+    bright = scene.fluxes()[scene.owner] > _MEASURABLE_FLUX * faintest
+    contained = np.select([scene.kind == EXPONENTIAL, scene.kind == DEVAUCOULEURS], [5.5, 10.0])
+    radius = np.where(bright, np.maximum(radius, contained), radius)
     # the positions of knots are Gaussian; not one in a hundred knots lies beyond about 3.5 sigma
     radius = np.where(scene.kind == KNOTS, 3.5 * KNOT_SIGMA, radius)
     smoothing = 4 * np.sqrt((scene.smoothing**2).sum(axis=(1, 2)))

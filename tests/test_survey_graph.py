@@ -78,7 +78,7 @@ def test_any_scheduler_makes_the_same_units_and_complete_catalogs(scheduler, tmp
 
 def test_the_graph_of_a_region_has_what_its_tiles_are_made_from(tmp_path):
     survey = survey_in(tmp_path / "store")
-    stages = ("truth", "pointings", "exposures", "coadds", "detections", "statistics")
+    stages = ("truth", "pointings", "psf_models", "exposures", "coadds", "coadd_noise", "detections", "statistics")
     whole, tile = survey.graph(stages), survey.tiles[0]
     region = Region(tile.ra - 1e-4, tile.ra + 1e-4, tile.dec - 1e-4, tile.dec + 1e-4)
     part = survey.graph(stages, region)

@@ -130,7 +130,10 @@ COMMANDS = {
     "override that is no YAML": ([*RUN, "seed={"], ["seed={", "not a valid value"]),
     "sequence without a path": ([*RUN, "roman.pointings={source: obseq}"], ["roman.pointings.path"]),
     "sequence cut": ([*RUN, "roman.pointings={source: obseq, path: cut.fits}"], ["cut.fits", "not a complete FITS"]),
-    "tiles that do not fit": ([*RUN, "coadds.pixels=12000"], ["GiB", "coadds.pixels", "run.memory_limit"]),
+    "tiles that do not fit": (
+        [*RUN, "coadds.pixels=12000", "coadds.patch_pixels=12000"],
+        ["GiB", "coadds.patch_pixels", "run.memory_limit"],
+    ),
     "whole sky in small cells": (["plan", "p.yaml", "region={ra: [0, 360], dec: [-90, 90]}"], ["cells", "truth.order"]),
     "tiles without number": (["plan", "p.yaml", "coadds.scale=1e-7"], ["tiles", "coadds.pixels"]),
     "pixfrac beyond one": (["plan", "p.yaml", "coadds.pixfrac=3"], ["coadds.pixfrac", "3"]),

@@ -53,6 +53,7 @@ def survey_of(rows: list[dict], bands: tuple[str, ...], name: str) -> tuple[Tabl
         coord_ra=60 + frame["x"] / 3600 / np.cos(np.radians(30)),
         coord_dec=-30 + frame["y"] / 3600,
         tile="tile",
+        patch="r0c0",
         **columns,
     )
     table = frame[["objectId", "truth_id"]].assign(star=False)

@@ -71,7 +71,9 @@ def table(name: str, frame: pd.DataFrame, order: int) -> TableProduct:
     """Return an object table with HEALPix partitions of any order."""
     columns = schema("objects", ("i",))
     blank = columns.empty_table().to_pandas()
-    missing = {name: np.full(len(frame), "" if name == "tile" else 0) for name in blank.columns if name not in frame}
+    missing = {
+        name: np.full(len(frame), "" if name in ("tile", "patch") else 0) for name in blank.columns if name not in frame
+    }
     full = frame.assign(**missing)
     full = with_spatial_index(full, "coord_ra", "coord_dec")
     cells = tuple(map(int, REGION.cells(order)))

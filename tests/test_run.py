@@ -61,7 +61,7 @@ def test_a_run_leaves_a_log_of_its_units_and_what_the_cluster_did(one_worker):
         "failed": 0,
     }
     page = path.with_suffix(".html").read_text()
-    assert "coadds-roman" in page
+    assert "coadds/roman" in page
     for line in re.findall(r"<(?:script|link)[^>]*>", page):
         assert "http" not in line
 

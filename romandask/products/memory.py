@@ -8,8 +8,8 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
-INTERPRETER = 480 << 20
-"""Bytes that a worker holds between units: Python, imported modules, and cached detector and spectral data."""
+INTERPRETER = 560 << 20
+"""Bytes that a worker holds between units: Python, imported modules, products, and cached detector and spectral data."""
 
 
 def release_free_memory() -> None:

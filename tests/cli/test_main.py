@@ -113,8 +113,9 @@ def test_ingest_accounts_for_every_row(shared, tmp_path):
     assert (tmp_path / "s" / "truth" / "galaxies" / "collection.properties").is_file()
 
 
-def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path):
+def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path, monkeypatch):
     """The paper has 29,153 SCA images, 1039 tiles and 15.3 square degrees."""
+    monkeypatch.setenv("COLUMNS", "120")
     done = command("plan", "troxel2023", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = [line.replace("│", " ").split() for line in done.stdout.splitlines() if "/" in line]
@@ -126,4 +127,4 @@ def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path):
     assert list(tmp_path.iterdir()) == []
     done = command("plan", "troxel2023", "run.memory_limit=1.8", cwd=tmp_path)
     assert done.returncode == 2
-    assert "lower coadds.pixels, or raise run.memory_limit" in done.stderr
+    assert "lower render.largest, or raise run.memory_limit" in done.stderr

@@ -20,8 +20,18 @@ from romandask.survey import Survey
 
 TO_STATISTICS = Selection(
     (
-        *("truth", "pointings", "exposures", "coadds", "coadd_noise", "detections", "truth_match", "truth_summary"),
-        *("zero_points", "objects", "limits", "samples", "differences", "matches", "chance", "statistics"),
+        *("truth", "pointings", "psf_models", "exposures", "coadds", "coadd_noise", "detections", "truth_match"),
+        *(
+            "truth_summary",
+            "zero_points",
+            "objects",
+            "limits",
+            "samples",
+            "differences",
+            "matches",
+            "chance",
+            "statistics",
+        ),
     )
 )
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 INTERPRETER = 560 << 20
-"""Bytes that a worker holds between units: Python, imported modules, products, and cached detector and spectral data."""
+"""Bytes that a worker holds between units: Python, modules, products, and cached detector and spectral data."""
 
 
 def release_free_memory() -> None:

@@ -127,4 +127,4 @@ def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     done = command("plan", "troxel2023", "run.memory_limit=1.8", cwd=tmp_path)
     assert done.returncode == 2
-    assert "lower render.largest, or raise run.memory_limit" in done.stderr
+    assert "raise truth.order, or raise run.memory_limit" in done.stderr

@@ -8,7 +8,7 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
-INTERPRETER = 560 << 20
+INTERPRETER = 520 << 20
 """Bytes that a worker holds between units: Python, modules, products, and cached detector and spectral data."""
 
 

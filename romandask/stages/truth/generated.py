@@ -135,7 +135,8 @@ def matter(settings: TruthSettings, region: Region, seed: int) -> ImageProduct:
         lengths=(1,),
         coordinates=lambda: coordinates,
         attributes={"nside": settings.nside},
-        bytes_per_unit=bytes_of(settings.nside) + 10 * 4 * count * len(pixels),
+        # power spectra, then shells
+        bytes_per_unit=(160 << 20) + bytes_of(settings.nside) + 10 * 4 * count * len(pixels),
         seconds_per_unit=5 + 2e-4 * settings.nside**2,
     )
 

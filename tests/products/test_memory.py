@@ -46,18 +46,24 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_unit_takes_more_than_its_stage_states(case, tmp_path):
-    """A worker of 2 GiB makes them all, one after another, with what stays in its heap; none is lost."""
+    """A worker of 2 GiB makes them all, one after another, with what stays in its heap; none is lost.
+
+    A unit does not take more than it states on top of what the worker held before (there is no warning), and no unit
+    brings the worker above the largest statement of all stages, which the plan compares with the limit.
+    """
     pipeline, *overrides = CASES[case]
     done = command("run", pipeline, "--store", "s", "--workers", "1", *overrides, *THIN, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    survey, over = open_survey(tmp_path / "s"), {}
+    survey, peaks, states = open_survey(tmp_path / "s"), {}, []
     for stage in stage_products(survey):
-        states = survey.product(stage.name).bytes_per_unit + INTERPRETER
         for name, record in read_records(survey.store, stage.name):
-            if record.peak_bytes > states:
-                over[f"{stage.name}/{name}"] = (record.peak_bytes / 2**30, states / 2**30)
+            states.append(survey.product(stage.name).bytes_per_unit + INTERPRETER)
+            peaks[f"{stage.name}/{name}"] = record.peak_bytes
             assert not [text for text in record.warnings if "memory" in text], (stage.name, name)
-    assert not over
+    largest = max(peaks, key=peaks.get)
+    assert peaks[largest] <= max(states), (largest, peaks[largest] / 2**30, max(states) / 2**30)
     log = next((tmp_path / "s" / "log").glob("*.jsonl"))
-    units = [event for event in map(json.loads, Path(log).read_text().splitlines()) if event["event"] == "unit"]
+    events = [json.loads(line) for line in Path(log).read_text().splitlines()]
+    assert not [event for event in events if event["event"] == "lost"]
+    units = [event for event in events if event["event"] == "unit"]
     assert len({(event["stage"], event["unit"]) for event in units}) == len(units), "made once each: no worker was lost"

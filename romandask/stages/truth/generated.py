@@ -136,7 +136,7 @@ def matter(settings: TruthSettings, region: Region, seed: int) -> ImageProduct:
         coordinates=lambda: coordinates,
         attributes={"nside": settings.nside},
         # power spectra, then shells
-        bytes_per_unit=(160 << 20) + bytes_of(settings.nside) + 10 * 4 * count * len(pixels),
+        bytes_per_unit=max(160 << 20, bytes_of(settings.nside) + 10 * 4 * count * len(pixels)),
         seconds_per_unit=5 + 2e-4 * settings.nside**2,
     )
 

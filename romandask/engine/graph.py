@@ -75,6 +75,10 @@ class UnitGraph(DaskMethodsMixin):
     def __repr__(self) -> str:
         return f"UnitGraph({len(self)} units of {len(self.stages)} stages)"
 
+    def units(self) -> list[Source]:
+        """Return all units of the graph, in the order of the stages."""
+        return [(stage.product.stage, name) for stage in self.stages for name in stage.tasks]
+
     def layer(self, stage: str) -> str:
         """Return the name of the layer of a stage."""
         return f"{stage}-{self.token}"
@@ -148,7 +152,7 @@ class UnitGraph(DaskMethodsMixin):
         size : int
             Largest number of units of a piece.
         """
-        units = [(stage.product.stage, name) for stage in self.stages for name in stage.tasks]
+        units = self.units()
         if len(units) <= size:
             return [set(units)]
         last = {stage.product.stage for stage in self.stages if stage.last}
@@ -182,11 +186,10 @@ class UnitGraph(DaskMethodsMixin):
         return replace(self, stages=stages)
 
     def __dask_keys__(self) -> list[Key]:
-        units = [self.key((stage.product.stage, name)) for stage in self.stages for name in stage.tasks]
         ends = [
             ("end-" + self.layer(stage.product.stage), "files") for stage in self.stages if stage.finish is not None
         ]
-        return [*units, *ends]
+        return [*map(self.key, self.units()), *ends]
 
     def __dask_layers__(self) -> tuple[str, ...]:
         return tuple(self.layer(stage.product.stage) for stage in self.stages)
@@ -198,8 +201,7 @@ class UnitGraph(DaskMethodsMixin):
     __dask_optimize__ = None
 
     def __dask_postcompute__(self) -> tuple[Callable[..., dict[str, UnitResult]], tuple[Any, ...]]:
-        names = [f"{stage.product.stage}/{name}" for stage in self.stages for name in stage.tasks]
-        return _by_name, (names,)
+        return _by_name, ([f"{stage}/{name}" for stage, name in self.units()],)
 
     def __dask_postpersist__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return partial(_persisted, self), ()

@@ -121,7 +121,7 @@ class _Submitted:
             piece = piece.part(units - skipped, {})
         stages = {stage.product.stage: self._graph.begin_task(stage)[0] for stage in piece.stages}
         begins = {stage: key for stage, key in stages.items() if stage not in self._begun}
-        keys = [self._graph.key((stage.product.stage, name)) for stage, name in _units(piece)]
+        keys = [self._graph.key(source) for source in piece.units()]
         found = self._client.get(piece.high_level_graph(self._begun.keys()), [*begins.values(), *keys], sync=False)
         self._begun |= dict(zip(begins, found[: len(begins)], strict=True))
         for key, future in zip(keys, found[len(begins) :], strict=True):
@@ -199,7 +199,7 @@ class OnCluster:
             If the cluster has no worker for a minute.
         """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        sources = {graph.key((stage.product.stage, name)): (stage.product.stage, name) for stage, name in _units(graph)}
+        sources = {graph.key(source): source for source in graph.units()}
         waiting, submitted = graph.pieces(PIECE), _Submitted(self._client, graph, ended.put)
         last_worker_seen = time.monotonic()
         with watched_workers(self._client, sources) as losses:
@@ -246,10 +246,6 @@ class OnCluster:
                 continue
             error = future.exception() if future.status == "error" else None
             yield Ended(source, None, _failure_text(future, error), error)
-
-
-def _units(graph: UnitGraph) -> Iterator[tuple[StageUnits, str]]:
-    return ((stage, name) for stage in graph.stages for name in stage.tasks)
 
 
 def _failure_text(future: Any, error: BaseException | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 from romandask.engine.task import Product, Task, stale_reason
@@ -117,17 +117,13 @@ def find_stale(
     mean = sum(task.cost for task in tasks.values()) / max(1, len(tasks))
     seconds = max(product.seconds_per_unit, 0.01) / max(mean, 1e-9)
     return Staleness(
-        tasks={name: _with_cost(task, task.cost * seconds) for name, task in tasks.items()},
+        tasks={name: replace(task, cost=task.cost * seconds) for name, task in tasks.items()},
         sources=sources,
         kept=kept,
         blocked=blocked,
         failed=skipped,
         outdated=[name for name in blocked if name in records],
     )
-
-
-def _with_cost(task: Task, cost: float) -> Task:
-    return Task(task.index, task.parts, task.unknown, cost, task.why, task.failed_inputs)
 
 
 def remove_outdated_records(product: Product, store: Store, staleness: Staleness) -> None:

@@ -6,10 +6,9 @@ An instrument whose PSF differs between the visits has no such stage; its PSFs a
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from typing import Any, Protocol, Self, overload
+from typing import Any, Protocol, Self
 
 import numpy as np
 import pandas as pd
@@ -17,7 +16,7 @@ import pandas as pd
 from romandask.instruments.exposure import Exposure, exposures_of
 from romandask.instruments.instrument import Instrument
 from romandask.instruments.psf_image import PSF_IMAGE_SIDE, centre_image
-from romandask.kernels.rendering.psf import BrightPsf, PsfModel
+from romandask.kernels.rendering.psf import BrightPsf, NodeTransforms, PsfModel
 from romandask.kernels.rendering.psf_layout import PsfLayout, arrays_of, model_of, padded, trimmed
 from romandask.model.errors import UserError
 from romandask.products.images import Coordinates, ImageProduct
@@ -174,7 +173,7 @@ def _centre(unit: _UnitKey) -> np.ndarray:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Transforms(Sequence[np.ndarray]):
+class _Transforms(NodeTransforms):
     """Transforms of the nodes of a PSF of bright stars; each is read, or made, when it is accessed."""
 
     unit: _UnitKey
@@ -188,15 +187,9 @@ class _Transforms(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return self.length
 
-    @overload
-    def __getitem__(self, index: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
-    def __getitem__(self, index: int | slice) -> np.ndarray | Sequence[np.ndarray]:
-        """Return the transform of a node, or a list of those of a slice."""
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        name = _bright_name(self.number, range(len(self))[index])
+    def transform(self, node: int) -> np.ndarray:
+        """Return the transform of a node."""
+        name = _bright_name(self.number, node)
         return trimmed(self.unit.load(name)[name], self.shape)
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from threading import RLock
-from typing import Any, overload
+from typing import Any
 
 import galsim
 import galsim.roman
@@ -15,7 +15,16 @@ from galsim.roman import roman_psfs
 
 from romandask.instruments.roman.bands import BANDS
 from romandask.kernels.rendering.diffraction import Pupil, diffraction
-from romandask.kernels.rendering.psf import CORE, Grid, PsfModel, Variation, edge_brightness, model, place_grid
+from romandask.kernels.rendering.psf import (
+    CORE,
+    Grid,
+    NodeTransforms,
+    PsfModel,
+    Variation,
+    edge_brightness,
+    model,
+    place_grid,
+)
 from romandask.kernels.universe.bandpasses import roman_bandpass
 
 PSF_EXTENT_PIXELS = 4096
@@ -190,7 +199,7 @@ def over_sca(sca: int, band: str, n_waves: int, degree: int, diffusion: float) -
 
 
 @dataclass(frozen=True, kw_only=True)
-class WideNodes(Sequence[np.ndarray]):
+class WideNodes(NodeTransforms):
     """PSFs of a finer pupil in the middle of an SCA, for `BrightPsf.nodes`."""
 
     sca: int
@@ -209,17 +218,8 @@ class WideNodes(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return len(self.waves)
 
-    @overload
-    def __getitem__(self, index: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
-    def __getitem__(self, index: int | slice) -> np.ndarray | Sequence[np.ndarray]:
-        """Return the transform (grid.shape) of the PSF at a wavelength, or a list of those of a slice."""
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        return self._transform(self.waves[index])
-
     @_one_thread
-    def _transform(self, wave: float) -> np.ndarray:
-        transform = transforms(self.sca, self.band, np.array([wave]), self.pupil_bin, MIDDLE, self.grid, self.diffusion)
-        return transform[0]
+    def transform(self, node: int) -> np.ndarray:
+        """Return the transform (grid.shape) of the PSF at a node."""
+        waves = np.array([self.waves[node]])
+        return transforms(self.sca, self.band, waves, self.pupil_bin, MIDDLE, self.grid, self.diffusion)[0]

@@ -6,9 +6,11 @@ Positions are pixel coordinates x, y, 0 at the centre of the first pixel.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import overload
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
@@ -71,6 +73,24 @@ class Variation:
     """Total degree of the polynomials in x and y."""
     differences: np.ndarray
     """Transforms on the grid of the core, shape (nodes, positions, rows, columns), complex64."""
+
+
+class NodeTransforms(Sequence[np.ndarray], ABC):
+    """Transforms of a PSF at its nodes, each of which is found when it is accessed, because they are large."""
+
+    @abstractmethod
+    def transform(self, node: int) -> np.ndarray:
+        """Return the transform (grid.shape) of the PSF at a node."""
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        """Return the transform of the PSF at a node, or a list of those of a slice."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        return self.transform(range(len(self))[index])
 
 
 @dataclass(frozen=True)

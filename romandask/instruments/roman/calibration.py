@@ -151,8 +151,8 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
         axes=("sca",),
         lengths=(len(scas),),
         coordinates=coordinates,
-        # the largest plane, in the dtype of the file and in that of the store
-        bytes_per_unit=1300 << 20,
+        # the largest values, in the dtype of the file and in that of the store, and a mask of them
+        bytes_per_unit=850 << 20,
         seconds_per_unit=15.0,
         stream=maker.stream,
     )
@@ -177,9 +177,22 @@ class MakeCalibration:
         for name, values in self.source.planes(self.scas[index]):
             if name in dtypes:
                 # the read noise of an exposure; planes 0 and 1 are the reset noise and its scatter
-                values = values[2] if name == "READ" else values
-                # the bits that fit into uint8
-                values = values & 255 if name == "BADPIX" else values
-                # the largest float16
-                values = np.minimum(values, 65504) if dtypes[name] == "float16" else values
-                yield name, values.astype(dtypes[name], copy=False)
+                values = _converted(values[2] if name == "READ" else values, dtypes[name])
+                yield name, values
+            # before the next values are made
+            del values
+
+
+def _converted(values: np.ndarray, dtype: str) -> np.ndarray:
+    """Return values in the dtype of the store, converted a row or a plane at a time to save memory.
+
+    Bits of BADPIX without a meaning are dropped, and values above the largest float16 are set to it.
+    """
+    converted = np.empty(values.shape, dtype)
+    for k, part in enumerate(values):
+        if dtype == "uint8":
+            part = part & 255
+        elif dtype == "float16":
+            part = np.minimum(part, 65504)
+        converted[k] = part
+    return converted

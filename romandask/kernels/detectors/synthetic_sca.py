@@ -157,8 +157,10 @@ def nonlinearity(generators: Generators) -> np.ndarray:
     """
     rng = generators("CNL")
     size = np.array([3e-2 / 1e5, 1e-2 / 1e5**2, 5e-3 / 1e5**3])
-    scatter = 1 + 0.1 * rng.standard_normal((3, *SCA_SHAPE), np.float32)
-    return size[:, None, None] * scatter
+    planes = np.empty((3, *SCA_SHAPE))
+    for plane, typical in zip(planes, size[:, None, None], strict=True):
+        plane[:] = typical * (1 + 0.1 * rng.standard_normal(SCA_SHAPE, np.float32))
+    return planes
 
 
 def capacitance(generators: Generators) -> np.ndarray:

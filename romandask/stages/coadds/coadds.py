@@ -29,6 +29,7 @@ from romandask.stages.coadds.warped import WarpTile
 from romandask.stages.exposures.exposures import Exposures, header_text
 from romandask.stages.exposures.render import cone
 from romandask.stages.pointings import corners_of
+from romandask.stages.psf_models import SharedPsfs
 from romandask.stages.stage import UNITS_FROM_POINTINGS, Stage, SurveyContext
 from romandask.storage.arrays import Variable
 from romandask.storage.manifest import digest
@@ -130,12 +131,12 @@ def coadds(exposures: Exposures, tiles: list[Tile], settings: CoaddSettings) -> 
         patches=patches,
         coordinates=coordinates,
         attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
-        # sums, sets and dq; the part of the exposure that is being added, its image, its noise, and the chunks read
+        # sums, sets and dq; the part of the exposure that is being added, its image, its noise, the chunks read; PSF
+        # models
         bytes_per_unit=max(
-            int(side**2 * ((7 if drizzled else 45) + 4 * planes) + (0 if drawn else part * 30))
-            + (300 << 20 if drawn else 80 << 20),
-            # sampling the PSFs of the exposures, which does not depend on the size of the patch
-            0 if drawn else 700 << 20,
+            int(side**2 * ((7 if drizzled else 45) + 4 * planes) + (0 if drawn else part * 30)) + (300 << 20),
+            # sampling PSFs that differ between exposures, which does not depend on the size of the patch
+            0 if drawn or isinstance(renderer.psfs, SharedPsfs) else 700 << 20,
         ),
         seconds_per_unit=side**2 * (seconds[0] + seconds[1] * float(members.counts.mean())),
         tables={"sets": schema("sets")} if drizzled else {},

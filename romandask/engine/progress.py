@@ -19,6 +19,8 @@ TOTAL = "all stages"
 """Name of the progress of the whole run."""
 SHOWN_STAGES = 4
 """Largest number of active stages in a plain line."""
+KNOWN_SHARE = 0.005
+"""Share of the cost from which on the remaining time is estimated: the first units are the smallest."""
 MAX_SILENCE = 8.0
 """Time without output after which the current activity is printed again, s."""
 
@@ -67,8 +69,8 @@ class Pace:
         self.done, self.cost_done, self.last_end = self.done + 1, self.cost_done + cost, now
 
     def seconds_left(self) -> float | None:
-        """Return the estimated remaining time, s; None if the stage has finished or no unit has."""
-        known = self.cost_done > 0 and self.done < self.units
+        """Return the estimated remaining time, s; None if the stage has finished, or too few units to tell have."""
+        known = self.cost_done > KNOWN_SHARE * self.cost and self.done < self.units
         return self.seconds_worked * (self.cost - self.cost_done) / self.cost_done if known else None
 
     def text(self, name: str, now: float) -> str:

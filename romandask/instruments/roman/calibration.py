@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -151,8 +151,8 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
         axes=("sca",),
         lengths=(len(scas),),
         coordinates=coordinates,
-        # the largest values, in the dtype of the file and in that of the store, and a mask of them
-        bytes_per_unit=850 << 20,
+        # the largest values, in the dtype of a file and in that of the store, and a mask of them
+        bytes_per_unit=(700 if source.folder else 600) << 20,
         seconds_per_unit=15.0,
         stream=maker.stream,
     )
@@ -173,26 +173,27 @@ class MakeCalibration:
 
     def stream(self, index: int) -> Iterator[tuple[str, np.ndarray]]:
         """Yield name and values of the arrays of a unit, one at a time."""
-        dtypes = {variable.name: variable.dtype for variable in VARIABLES}
+        variables = {variable.name: variable for variable in VARIABLES}
         for name, values in self.source.planes(self.scas[index]):
-            if name in dtypes:
-                # the read noise of an exposure; planes 0 and 1 are the reset noise and its scatter
-                values = _converted(values[2] if name == "READ" else values, dtypes[name])
-                yield name, values
+            if name in variables:
+                if name == "READ":
+                    # the read noise of an exposure; planes 0 and 1 are the reset noise and its scatter
+                    values = tuple(values)[2]
+                yield name, _stored(values, variables[name])
             # before the next values are made
             del values
 
 
-def _converted(values: np.ndarray, dtype: str) -> np.ndarray:
-    """Return values in the dtype of the store, converted a row or a plane at a time to save memory.
+def _stored(values: Iterable[np.ndarray], variable: Variable) -> np.ndarray:
+    """Return values in shape and dtype of the store, converted one index of the first axis at a time to save memory.
 
     Bits of BADPIX without a meaning are dropped, and values above the largest float16 are set to it.
     """
-    converted = np.empty(values.shape, dtype)
+    stored = np.empty(variable.shape, variable.dtype)
     for k, part in enumerate(values):
-        if dtype == "uint8":
+        if variable.dtype == "uint8":
             part = part & 255
-        elif dtype == "float16":
+        elif variable.dtype == "float16":
             part = np.minimum(part, 65504)
-        converted[k] = part
-    return converted
+        stored[k] = part
+    return stored

@@ -72,7 +72,7 @@ def flat(kernels: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(kernels.transpose(2, 0, 3, 1)).reshape(n * by, n * bx)
 
 
-def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source: str) -> None:
+def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray | Iterable[np.ndarray]]], source: str) -> None:
     """Write a calibration file, with one extension in memory at a time.
 
     Parameters
@@ -81,9 +81,9 @@ def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source
         Path of the file; it is replaced once the new file is complete.
     sca : int
         Number of the SCA.
-    planes : iterable of (str, ndarray)
-        Names and values of the extensions with values, in the order of TABLE, without BFEFLAT and IPCFLAT, which follow
-        from BFE and IPC.
+    planes : iterable of (str, ndarray or iterable of ndarray)
+        Names and values, or planes of the first axis of the values, of the extensions with values, in the order of
+        TABLE, without BFEFLAT and IPCFLAT, which follow from BFE and IPC.
     source : str
         Source of every extension, for the table SOURCES.
 
@@ -112,7 +112,8 @@ def write(path: Path, sca: int, planes: Iterable[tuple[str, np.ndarray]], source
                 elif extension.name in FLAT:
                     hdu = fits.ImageHDU(flat(kernels.pop(FLAT[extension.name])), name=extension.name)
                 else:
-                    name, values = next(remaining)
+                    name, made = next(remaining)
+                    values = made if isinstance(made, np.ndarray) else np.stack(list(made))
                     if (name, values.shape, values.dtype) != (extension.name, extension.shape, extension.dtype):
                         raise ValueError(f"{name} {values.dtype} {values.shape}: expected {extension}")
                     if name in FLAT.values():

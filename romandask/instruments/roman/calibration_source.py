@@ -50,8 +50,11 @@ class CalibrationSource:
         for sca in scas:
             check(path_of(self.folder, sca))
 
-    def planes(self, sca: int) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield names and values of the calibrations of an SCA, in the order of table 1 of Troxel et al. (2023)."""
+    def planes(self, sca: int) -> Iterator[tuple[str, np.ndarray | Iterator[np.ndarray]]]:
+        """Yield names and values of the calibrations of an SCA, in the order of table 1 of Troxel et al. (2023).
+
+        Values are arrays, or iterators over the planes of their first axis.
+        """
         if self.folder is None:
             yield from planes(partial(rng, self.seed, "calibration", sca))
             return

@@ -110,17 +110,17 @@ def area_kernels(generators: Generators) -> np.ndarray:
     return (kernel[:, :, None, None] * strength).astype(np.float32)
 
 
-def released_charge(generators: Generators) -> np.ndarray:
-    """Return PERSIST, (6, y, x), electrons: about 1e-4 of a charge of 1e4 e, 2e-3 at full well.
+def released_charge(generators: Generators) -> Iterator[np.ndarray]:
+    """Yield the six planes of PERSIST, (y, x), electrons: about 1e-4 of a charge of 1e4 e, 2e-3 at full well.
 
     The scatter is 30% per pixel.
     """
     rng = generators("PERSIST")
     share = np.array([5e-5, 7e-5, 1e-4, 3e-4, 2e-3, 2.5e-3]) * STIMULI
     scatter = np.exp(0.3 * rng.standard_normal(SCA_SHAPE, np.float32))
-    planes = share.astype(np.float32)[:, None, None] * scatter
-    planes[:, _border()] = 0
-    return planes
+    scatter[_border()] = 0
+    for factor in share.astype(np.float32):
+        yield factor * scatter
 
 
 def dark_current(generators: Generators, bits: np.ndarray) -> np.ndarray:
@@ -150,17 +150,15 @@ def full_well(generators: Generators) -> np.ndarray:
     return (1.1e5 * (1 + 0.04 * generators("SATURATE").standard_normal(SCA_SHAPE, np.float32))).astype(np.int32)
 
 
-def nonlinearity(generators: Generators) -> np.ndarray:
-    """Return CNL, (3, y, x) float64: b2, b3, b4 that remove 3%, 1% and 0.5% of a charge of 1e5 e.
+def nonlinearity(generators: Generators) -> Iterator[np.ndarray]:
+    """Yield the three planes of CNL, (y, x) float64: b2, b3, b4 that remove 3%, 1% and 0.5% of a charge of 1e5 e.
 
     The scatter is 10% per pixel.
     """
     rng = generators("CNL")
     size = np.array([3e-2 / 1e5, 1e-2 / 1e5**2, 5e-3 / 1e5**3])
-    planes = np.empty((3, *SCA_SHAPE))
-    for plane, typical in zip(planes, size[:, None, None], strict=True):
-        plane[:] = typical * (1 + 0.1 * rng.standard_normal(SCA_SHAPE, np.float32))
-    return planes
+    for typical in size:
+        yield typical * (1 + 0.1 * rng.standard_normal(SCA_SHAPE, np.float32)).astype(float)
 
 
 def capacitance(generators: Generators) -> np.ndarray:
@@ -175,19 +173,18 @@ def capacitance(generators: Generators) -> np.ndarray:
     return planes.astype(np.float32)
 
 
-def noise(generators: Generators, bits: np.ndarray) -> np.ndarray:
-    """Return READ, (3, y, x) float64: reset noise and its scatter (DN), and read noise of an exposure (electrons).
+def noise(generators: Generators, bits: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the three planes of READ, (y, x) float64: reset noise and its scatter (DN), and read noise (electrons).
 
-    The read noise is 8.5 +- 10%; noisy pixels have 2 to 10 times that.
+    The read noise of an exposure is 8.5 +- 10%; noisy pixels have 2 to 10 times that.
     """
     rng = generators("READ")
-    planes = np.empty((3, *SCA_SHAPE))
-    planes[0] = 20 * (1 + 0.05 * rng.standard_normal(SCA_SHAPE, np.float32))
-    planes[1] = 2 * (1 + 0.05 * rng.standard_normal(SCA_SHAPE, np.float32))
-    planes[2] = 8.5 * np.exp(0.1 * rng.standard_normal(SCA_SHAPE, np.float32))
+    for mean in (20, 2):
+        yield (mean * (1 + 0.05 * rng.standard_normal(SCA_SHAPE, np.float32))).astype(float)
+    plane = (8.5 * np.exp(0.1 * rng.standard_normal(SCA_SHAPE, np.float32))).astype(float)
     noisy = bits & NOISY > 0
-    planes[2, noisy] *= rng.uniform(2, 10, noisy.sum())
-    return planes
+    plane[noisy] *= rng.uniform(2, 10, noisy.sum())
+    yield plane
 
 
 def gain(generators: Generators) -> np.ndarray:
@@ -213,8 +210,11 @@ def _border() -> np.ndarray:
     return edge
 
 
-def planes(generators: Generators) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield name and values of each calibration of an SCA, one at a time: together they take 1.5 GB."""
+def planes(generators: Generators) -> Iterator[tuple[str, np.ndarray | Iterator[np.ndarray]]]:
+    """Yield name and values of each calibration of an SCA, one at a time: together they take 1.5 GB.
+
+    The values of the three largest are iterators over the planes of the first axis.
+    """
     bits = bad_pixels(generators)
     yield "RELQE1", relative_efficiency(generators, bits)
     yield "RELQE2", coloured_efficiency(generators)

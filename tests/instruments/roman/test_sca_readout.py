@@ -64,7 +64,7 @@ def test_earlier_exposures_are_of_the_same_sca_and_recent():
 
 def test_traps_hold_interpolated_charge_of_bright_pixels_only():
     planes = {
-        "PERSIST": released_charge(lambda name: rng(3, name)),
+        "PERSIST": np.stack(list(released_charge(lambda name: rng(3, name)))),
         "SATURATE": np.full((4096, 4096), 110_000, np.int32),
     }
     charge = np.zeros((4096, 4096), np.float32)

@@ -6,6 +6,7 @@ import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,23 +61,46 @@ MINI = (
     "truth.galaxies=150",
     "render.n_waves=3",
     "roman.psf_degree=0",
+    "truth.nside=64",
 )
 """Overrides that make the tiny pipeline a few seconds long."""
+MINI_RUN = ("run", "tiny", "--store", "s", "--workers", "0", "--no-report", *MINI)
+"""Command that makes it in one process, without a cluster."""
+
+
+def once(tmp_path_factory, worker_id: str, name: str, make: Callable[[Path], None]) -> Path:
+    """Return a folder that the first test process to ask for it fills; all processes share it, and only read."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder if worker_id == "master" else folder.parent) / name
+    folder.mkdir(exist_ok=True)
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "done").exists():
+            make(folder)
+            (folder / "done").write_text("")
+    return folder
 
 
 @pytest.fixture(scope="session")
 def tiny_store(tmp_path_factory, worker_id) -> Path:
     """The tiny pipeline, run once by the command line from an empty folder; test processes share it, and only read."""
-    folder = tmp_path_factory.getbasetemp()
-    folder = (folder if worker_id == "master" else folder.parent) / "tiny-survey"
-    folder.mkdir(exist_ok=True)
-    with open(folder / "lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "done").exists():
-            done = command("run", "tiny", "--store", "tiny", cwd=folder)
-            assert done.returncode == 0, done.stdout + done.stderr
-            (folder / "done").write_text("")
-    return folder / "tiny"
+
+    def make(folder: Path) -> None:
+        done = command("run", "tiny", "--store", "tiny", cwd=folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return once(tmp_path_factory, worker_id, "tiny-survey", make) / "tiny"
+
+
+@pytest.fixture(scope="session")
+def mini_store(tmp_path_factory, worker_id) -> Path:
+    """The tiny pipeline with MINI, made once in one process without a cluster, without a report; only to be read."""
+
+    def make(folder: Path) -> None:
+        done = command(*MINI_RUN, cwd=folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return once(tmp_path_factory, worker_id, "mini-survey", make) / "s"
 
 
 LONG = (
@@ -99,10 +123,10 @@ LONG = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take long: at the end, one process would run them alone.
 
-    A test of the stored tiny survey is slow: the first makes it.
+    A test of a stored survey is slow: the first makes it.
     """
     for item in items:
-        if "tiny_store" in getattr(item, "fixturenames", ()):
+        if {"tiny_store", "mini_store"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
     places = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.name, len(LONG)))

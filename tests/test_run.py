@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import MINI, ROOT, command
+from conftest import MINI, MINI_RUN, ROOT, command
 from output_hashes import output_hashes
 
 pytestmark = pytest.mark.slow
@@ -68,7 +69,7 @@ def test_a_run_leaves_a_log_of_its_units_and_what_the_cluster_did(one_worker):
 
 def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_path):
     """Started with two workers, killed with SIGKILL once exposures exist, then the same command again."""
-    arguments = [sys.executable, "-m", "romandask", "run", "tiny", "--store", "s", "--workers", "2", *MINI]
+    arguments = [sys.executable, "-m", "romandask", *MINI_RUN, "--workers", "2"]
     driver = subprocess.Popen(arguments, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     manifest = tmp_path / "s" / "manifest" / "exposures" / "roman"
     deadline = time.monotonic() + 240
@@ -79,7 +80,7 @@ def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_pat
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
     before = {name for name in output_hashes(tmp_path / "s") if name.startswith(("truth", "pointings"))}
-    done = command("run", "tiny", "--store", "s", "--workers", "2", *MINI, cwd=tmp_path)
+    done = command(*MINI_RUN, "--workers", "2", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert before
     assert int(done.stdout.split("kept ")[1].split(",")[0]) >= len(before)
@@ -88,25 +89,23 @@ def test_two_workers_and_a_killed_driver_give_the_same_bytes(one_worker, tmp_pat
 
 
 def test_a_rerun_has_nothing_to_do_and_a_changed_setting_makes_only_what_depends_on_it(one_worker):
-    again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    again = command(*MINI_RUN, cwd=one_worker.parent)
     assert again.returncode == 0, again.stderr
     assert "nothing to do" in again.stdout
     kept = {path: path.stat().st_mtime_ns for path in (one_worker / "manifest" / "coadds").rglob("*.json")}
     before = output_hashes(one_worker)
-    changed = command(
-        "run", "tiny", "--store", "s", "--workers", "0", *MINI, "detections.min_snr=8", cwd=one_worker.parent
-    )
+    changed = command(*MINI_RUN, "detections.min_snr=8", cwd=one_worker.parent)
     assert changed.returncode == 0, changed.stdout + changed.stderr
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items()), "coadds do not depend on detection"
     after = output_hashes(one_worker)
     assert any(after[name] != value for name, value in before.items() if name.startswith("detections"))
-    back = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    back = command(*MINI_RUN, cwd=one_worker.parent)
     assert back.returncode == 0
     assert output_hashes(one_worker) == before
 
 
 def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one_worker):
-    arguments = [sys.executable, "-m", "romandask", "run", "tiny", "--store", "s", "--workers", "1", *MINI]
+    arguments = [sys.executable, "-m", "romandask", *MINI_RUN, "--workers", "1"]
     driver = subprocess.Popen(
         arguments,
         cwd=tmp_path,
@@ -127,18 +126,17 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
     assert "the same command resumes" in errors
     assert "Traceback" not in errors
     assert not (tmp_path / "s" / ".lock").exists()
-    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    done = command(*MINI_RUN, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert output_hashes(tmp_path / "s") == output_hashes(one_worker)
 
 
-def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path):
+def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(mini_store, tmp_path):
     """If an exposure cannot be read, the units that need it fail with a traceback, and the exit code is 1.
 
     They are skipped after failure until --retry-failed; once the exposure is repaired, the output is as before.
     """
-    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
-    assert done.returncode == 0
+    shutil.copytree(mini_store, tmp_path / "s")
     shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
     record = next((tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.json"))
     before = output_hashes(tmp_path / "s")
@@ -148,19 +146,19 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(one_worker, tmp_path)
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 0x40
             path.write_bytes(content)
-    failed = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    failed = command(*MINI_RUN, cwd=tmp_path)
     assert failed.returncode == 1, failed.stdout
     assert "failed: coadds/roman/" in failed.stdout
     (reason,) = (tmp_path / "s" / "manifest" / "coadds" / "roman").glob("*.failed")
     written = reason.stat().st_mtime_ns
     assert "Traceback" in reason.read_text()
-    again = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    again = command(*MINI_RUN, cwd=tmp_path)
     assert again.returncode == 1
     assert f"failed: coadds/roman/{reason.stem} (skipped, it failed before)" in again.stdout
     assert "--retry-failed" in again.stdout
     assert reason.stat().st_mtime_ns == written
     assert command("verify", str(tmp_path / "s"), "--forget").returncode == 1
-    mended = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--retry-failed", cwd=tmp_path)
+    mended = command(*MINI_RUN, "--retry-failed", cwd=tmp_path)
     assert mended.returncode == 0, mended.stdout
     assert not reason.exists()
     assert output_hashes(tmp_path / "s") == before
@@ -173,7 +171,7 @@ def test_a_dry_run_explains_which_units_are_stale(one_worker):
         return done.stdout
 
     before = output_hashes(one_worker)
-    command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=one_worker.parent)
+    command(*MINI_RUN, cwd=one_worker.parent)
     assert dry_run().strip() == "every other unit is kept"
     lines = {line.split()[0]: line for line in dry_run("detections.min_snr=8").splitlines() if " make " in line}
     assert "changed: settings" in lines["detections/roman"]
@@ -195,10 +193,10 @@ def test_a_dry_run_explains_which_units_are_stale(one_worker):
 
 
 def test_a_stage_alone_makes_what_its_inputs_allow(tmp_path):
-    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "pointings", cwd=tmp_path)
+    done = command(*MINI_RUN, "--only", "pointings", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert sorted(name.split("/")[0] for name in output_hashes(tmp_path / "s")) == ["pointings", "pointings"]
-    early = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, "--only", "coadds/rubin", cwd=tmp_path)
+    early = command(*MINI_RUN, "--only", "coadds/rubin", cwd=tmp_path)
     assert early.returncode == 1
     assert "an input is missing" in early.stdout
 

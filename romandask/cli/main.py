@@ -135,6 +135,9 @@ def run(
     retry: Annotated[
         bool, typer.Option("--retry-failed", help="Also make the units that failed in an earlier run.")
     ] = False,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write the report once all stages are done.")
+    ] = True,
 ) -> None:
     """Make and store all missing and outdated units, then write the report. The same command resumes a run."""
     from romandask import run as running
@@ -179,7 +182,7 @@ def run(
         reporter.say(f"the reasons are in {store}/manifest/<stage>/<unit>.failed; --retry-failed makes them again")
         raise typer.Exit(1)
     page = Store(store).report / "index.html"
-    if only or start:
+    if only or start or not report:
         return
     if made or not page.exists():
         with reporter.busy("writing the report"):

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from conftest import MINI, command
+from conftest import MINI, MINI_RUN, command
 
 from romandask.cli.main import main
 from romandask.engine.staleness import StoredOutputs, find_stale, write_failure
@@ -34,11 +34,9 @@ DAMAGED_FILES = 60
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("faults")
-    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder / "s"
+def store(mini_store, tmp_path_factory) -> Path:
+    """A copy: damage is done to files of it."""
+    return shutil.copytree(mini_store, tmp_path_factory.mktemp("faults") / "s")
 
 
 def stored(store: Path) -> list[Path]:
@@ -159,7 +157,7 @@ NO_DAMAGE = {"manifest/statistics/blends/all.json", "manifest/objects/rubin/file
 
 
 def run_again(folder: Path) -> str:
-    done = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=folder)
+    done = command(*MINI_RUN, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -215,7 +213,7 @@ def test_units_that_have_read_damaged_data_are_made_when_it_is_forgotten(store, 
     )
     for record in (copy / "manifest" / "detections" / "roman").glob("*.json"):
         record.unlink()
-    failing = command("run", "tiny", "--store", "s", "--workers", "0", *MINI, cwd=tmp_path)
+    failing = command(*MINI_RUN, cwd=tmp_path)
     assert failing.returncode == 1
     assert [*(copy / "manifest" / "detections" / "roman").glob("*.failed")]
     assert command("verify", str(copy), "--forget").returncode == 1

@@ -1,6 +1,7 @@
-"""The memory that stages state, at the full size of their units: detectors of 4088 and 4096 pixels, tiles of 8825.
+"""The memory that stages state, at the full size of their units: detectors of 4088 and 4096 pixels, patches of 2208.
 
-Planes decide it, hardly the sources: these skies are thin. A run at the true density is in the figures of `one_tile`.
+Planes decide it, hardly the sources: these skies are thin, and a tile has 2 x 2 of the survey's 4 x 4 patches. A run at
+the true density and size is in the figures of `one_tile`.
 """
 
 import json
@@ -22,6 +23,7 @@ CASES = {
         "one_tile",
         "roman.bands=[H158]",
         "roman.pointings.dithers={H158: [2]}",
+        "coadds.pixels=4415",
         "region.ra=[53.05, 53.06]",
         "region.dec=[-39.95, -39.94]",
         "truth.margin=15",

@@ -134,7 +134,8 @@ def test_an_interrupt_leaves_a_store_that_the_same_command_resumes(tmp_path, one
 def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(mini_store, tmp_path):
     """If an exposure cannot be read, the units that need it fail with a traceback, and the exit code is 1.
 
-    They are skipped after failure until --retry-failed; once the exposure is repaired, the output is as before.
+    They are skipped after failure until --retry-failed; once the exposure is repaired, the output is as before, also
+    where the files of the units themselves are torn.
     """
     shutil.copytree(mini_store, tmp_path / "s")
     shard = next((tmp_path / "s" / "exposures" / "roman.zarr" / "image" / "c").rglob("0"))
@@ -146,6 +147,9 @@ def test_a_damaged_unit_fails_by_name_and_the_rest_goes_on(mini_store, tmp_path)
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 0x40
             path.write_bytes(content)
+    for path in (tmp_path / "s" / "coadds" / "roman.zarr" / "image" / "c").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     failed = command(*MINI_RUN, cwd=tmp_path)
     assert failed.returncode == 1, failed.stdout
     assert "failed: coadds/roman/" in failed.stdout

@@ -13,7 +13,14 @@ import pyarrow as pa
 
 from romandask.instruments.exposure import Exposure
 from romandask.instruments.readout import Light
-from romandask.kernels.detectors.simple_detector import NOT_DRAWN_VALUE, SIMPLE_FLAGS, WHOLE, Detector, observe
+from romandask.kernels.detectors.simple_detector import (
+    NOT_DRAWN,
+    NOT_DRAWN_VALUE,
+    SIMPLE_FLAGS,
+    WHOLE,
+    Detector,
+    observe,
+)
 from romandask.model.seeds import rng
 from romandask.storage.arrays import Variable
 
@@ -43,8 +50,8 @@ class SimpleReadout:
         }
         electrons = {"units": "electron", "long_name": "observed image", "not_drawn_value": NOT_DRAWN_VALUE}
         return (
-            Variable("image", "int32", self.shape, ("y", "x"), electrons),
-            Variable("dq", "uint8", self.shape, ("y", "x"), quality),
+            Variable("image", "int32", self.shape, ("y", "x"), electrons, fill=NOT_DRAWN_VALUE),
+            Variable("dq", "uint8", self.shape, ("y", "x"), quality, fill=NOT_DRAWN),
         )
 
     @property

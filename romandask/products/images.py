@@ -196,7 +196,7 @@ class ImageProduct:
     def verify(self, index: int, store: Store) -> str:
         """Return the hash of a stored unit; it equals `Record.output` if the unit is undamaged."""
         read = replace(self, store=store).reader(index)
-        parts = {variable.name: digest(read(variable.name, ())) for variable in self.variables}
+        parts = {variable.name: _hash(variable, read(variable.name, ())) for variable in self.variables}
         paths = {name: table_beside(store, self.stage, name, self.names[index]) for name in self.tables}
         return digest(parts | {name: digest(path.read_bytes()) for name, path in paths.items()})
 
@@ -221,7 +221,7 @@ class ImageProduct:
                 )
             array = array.astype(variable.dtype, copy=False)
             write_array(_array(group, variable.name), lead, array, corner)
-            parts[name] = digest(array)
+            parts[name] = _hash(variable, array)
             size, rows = size + array.nbytes, max(rows, array.size)
             del array
         if variables:
@@ -255,6 +255,18 @@ class ImageProduct:
 def table_beside(store: Store, stage: str, name: str, unit: str) -> AnyPath:
     """Return the file of a table (a name in `ImageProduct.tables`) of one unit of an image product."""
     return store.table(f"{stage}_{name}", unit)
+
+
+def _hash(variable: Variable, values: np.ndarray) -> str:
+    """Return the hash of the values of a unit; those outside the part that is not of the fill value are left out."""
+    if not variable.fill:
+        return digest(values)
+    other = values != variable.fill
+    part = tuple(
+        slice(int(used[0]), int(used[-1]) + 1) if len(used := np.flatnonzero(other.any(axis=1 - axis))) else slice(0)
+        for axis in range(2)
+    )
+    return digest(values.shape, [(place.start, place.stop) for place in part], values[part])
 
 
 def _array(group: zarr.Group, name: str) -> Any:

@@ -51,6 +51,8 @@ class Variable:
     zeros: bool = False
     """True for a variable that is not compressed but has large areas of zeros, which are then stored as almost nothing
     (LZ4, which copies other values as they are)."""
+    fill: float = 0
+    """Value of which large areas may consist; chunks of it are not stored, except in a file that has no others."""
 
     @property
     def is_image(self) -> bool:
@@ -204,8 +206,8 @@ def open_images(path: AnyPath, layout: Layout) -> zarr.Group:
             array = group[variable.name]
             if not isinstance(array, zarr.Array):
                 raise UserError(f"{path}/{variable.name}: not an array: use another store")
-            stored = array.shape[len(unit_lengths) :], array.chunks, array.shards, array.dtype
-            if stored == (variable.shape, chunks, shards, np.dtype(variable.dtype)):
+            stored = array.shape[len(unit_lengths) :], array.chunks, array.shards, array.dtype, array.fill_value
+            if stored == (variable.shape, chunks, shards, np.dtype(variable.dtype), variable.fill):
                 if array.shape != shape:
                     array.resize(shape)
                 array.update_attributes(variable.attributes)
@@ -220,7 +222,7 @@ def open_images(path: AnyPath, layout: Layout) -> zarr.Group:
             chunks=chunks,
             shards=shards,
             compressors=[*packing, Crc32cCodec()],
-            fill_value=0,
+            fill_value=variable.fill,
             dimension_names=(*unit_axes, *variable.axes),
             attributes=variable.attributes,
             overwrite=True,
@@ -256,8 +258,9 @@ def write_array(
         Row and column of the first pixel of the unit in the stored image, which has the pixels of other units too if it
         is divided into patches; an array of one axis has only the second.
     """
-    # a setting of the writer, not of the array; without it, chunks of zeros would not be written and would be missing
-    array = array.with_config({"write_empty_chunks": True})
+    # settings of the writer, not of the array. A chunk of the fill value is left out of a file that has others, whose
+    # index says so; a file of such chunks alone is written, because a missing file is an error.
+    complete, sparse = (array.with_config({"write_empty_chunks": written}) for written in (True, False))
     file_shape = (array.shards or array.chunks)[len(unit_index) :]
     starts = [range(0, length, step) for length, step in zip(values.shape[-2:], file_shape[-2:], strict=True)]
     corner = corner[-len(starts) :]
@@ -271,8 +274,9 @@ def write_array(
         planes = (0,) * (values.ndim - 2)
         rows_and_columns = (place.start // step for place, step in zip(stored, file_shape[-2:], strict=True))
         _remove_file(array, (*unit_index, *planes, *rows_and_columns))
+        writer = complete if array.shards is None or (values[own] == array.fill_value).all() else sparse
         with limited_concurrency():
-            array[(*unit_index, ..., *stored)] = values[own]
+            writer[(*unit_index, ..., *stored)] = values[own]
 
 
 def _remove_file(array: zarr.Array[Any], file_index: tuple[int, ...]) -> None:

@@ -77,6 +77,27 @@ def test_a_damaged_unit_is_written_again(tmp_path, damage):
     assert product.verify(1, store) == written[1].output
 
 
+def test_chunks_of_the_fill_value_are_stored_only_in_files_without_others(tmp_path):
+    """What is left out of a file is in its index; a file of nothing else is written, so that a missing one is found."""
+    part = Variable("part", "int32", (1024, 1024), ("y", "x"), {}, fill=-7)
+    images = np.full((2, 1024, 1024), -7, np.int32)
+    images[1, 600:700, 100:200] = np.random.default_rng(1).integers(0, 1 << 30, (100, 100))
+    product = replace(image_product(2), make=lambda k: {"part": images[k]}, variables=(part,)).stored(Store(tmp_path))
+    product.prepare(product.store)
+    for index in range(2):
+        made = product.write(index, product.store)
+        np.testing.assert_array_equal(product.reader(index)("part"), images[index])
+        assert product.verify(index, product.store) == made.output
+    first, second = sorted(path for path in tmp_path.rglob("c/*/0/0") if path.is_file())
+    # the index is at the end of a file, before its checksum: offset and length of each chunk, -1 for one left out
+    for path, left_out in ((first, 0), (second, 3)):
+        index = np.frombuffer(path.read_bytes()[-68:-4], "<i8").reshape(4, 2)
+        assert (index == -1).all(axis=1).sum() == left_out
+    first.unlink()
+    with pytest.raises(UserError, match="is damaged"):
+        product.reader(0)("part")
+
+
 def test_images_are_read_back_and_arrays_grow_with_the_number_of_units(tmp_path):
     store = Store(tmp_path)
     image_product(3).prepare(store)

@@ -268,6 +268,7 @@ def exposures(
         shape=instrument.shape,
         axes=("y", "x"),
         attributes={**image.attributes, "long_name": "noiseless image of the objects"},
+        fill=image.fill,
     )
     mesh = Variable(
         name="background_mesh",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -248,7 +249,8 @@ class ImageProduct:
     @cached_property
     def dataset(self) -> xr.Dataset:
         """The lazy dataset, with one chunk per unit. The variables of a unit are read or made together, once."""
-        name = f"{self.stage.replace('/', '-')}-" + digest([unit.settings for unit in self.units])
+        # a name of its own, as the settings of the units do not say what the units are made from
+        name = f"{self.stage.replace('/', '-')}-{uuid.uuid4().hex}"
         return lazy_dataset(name, self.layout, self, self.coordinates(), self.attributes)
 
 

@@ -32,7 +32,7 @@ def lazy_dataset(
     Parameters
     ----------
     name : str
-        Prefix of the names of the tasks; it must identify the content.
+        Prefix of the names of the tasks; no other dataset may have it.
     layout : Layout
         Arrays of the product, and its units.
     source : Loads

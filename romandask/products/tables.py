@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -50,6 +51,12 @@ class TableProduct:
     def names(self) -> tuple[str, ...]:
         """Names of the units."""
         return names_of(self.units)
+
+    @cached_property
+    def token(self) -> str:
+        """Identifies the object for dask. The settings of its units do not say what they are made from, and hashing the
+        object with all upstream products, as dask would, takes half a minute."""
+        return uuid.uuid4().hex
 
     @property
     def product(self) -> TableProduct:
@@ -239,6 +246,9 @@ class TableProduct:
 class _LoadPartition:
     product: TableProduct
 
+    def __dask_tokenize__(self) -> tuple[str, str]:
+        return type(self).__name__, self.product.token
+
     def __call__(self, index: int) -> pd.DataFrame:
         return _with_arrow_lists(self.product.load(index), self.product.schema)
 
@@ -259,6 +269,9 @@ class _LoadWithin:
     region: Region | Cone
     ra: str
     dec: str
+
+    def __dask_tokenize__(self) -> tuple[object, ...]:
+        return type(self).__name__, self.product.token, type(self.region).__name__, vars(self.region), self.ra, self.dec
 
     def __call__(self, index: int) -> pd.DataFrame:
         frame = _with_arrow_lists(self.product.load(index), self.product.schema)

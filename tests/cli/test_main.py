@@ -127,4 +127,5 @@ def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     done = command("plan", "troxel2023", "run.memory_limit=1.8", cwd=tmp_path)
     assert done.returncode == 2
-    assert "raise truth.order, or raise run.memory_limit" in done.stderr
+    assert "needs 1.8 GiB" in done.stderr
+    assert ", or raise run.memory_limit" in done.stderr

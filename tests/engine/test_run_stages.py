@@ -229,6 +229,8 @@ def test_a_full_store_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr("romandask.engine.run_stages.refuse_full", full)
     stages = [
         stage_of("coadds/x", 1, WaitingMaker(failing=(0,))),
+        # read by another stage, the coadd is tried before the units of the truth index
+        stage_of("detections/x", 1, WaitingMaker(), (("coadds/x", "u0"),)),
         stage_of("truth_index/x", 40, WaitingMaker(wait_for=tmp_path / "never")),
     ]
     with runner(1, 1.5) as execution:

@@ -4,6 +4,7 @@ import pickle
 from dataclasses import replace
 from pathlib import Path
 
+import dask
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -109,6 +110,24 @@ def test_images_are_read_back_and_arrays_grow_with_the_number_of_units(tmp_path)
     np.testing.assert_array_equal(array[1], image_product(3).make(1)["image"])
     np.testing.assert_array_equal(array[4], image_product(3).make(4)["image"])
     assert first.output == digest({"image": digest(image_product(3).make(1)["image"])})
+
+
+def test_products_that_differ_only_in_what_they_are_made_from_are_told_apart_by_dask():
+    """Two surveys are compared in one graph, in which equal names would mean equal values."""
+    first, second = image_product(2), replace(image_product(2), make=lambda k: {"image": np.ones((64, 48), np.float32)})
+    difference = (first.dataset["image"] - second.dataset["image"]).compute()
+    np.testing.assert_array_equal(difference[1], first.make(1)["image"] - 1)
+    schema = pa.schema([pa.field("number", pa.int64())])
+    tables = [
+        TableProduct(
+            stage="t/x",
+            units=(Unit("u", 0),),
+            schema=schema,
+            make=lambda k, value=value: pd.DataFrame({"number": [value]}),
+        )
+        for value in (1, 2)
+    ]
+    assert [int(value) for value in dask.compute(*(table.frame["number"].sum() for table in tables))] == [1, 2]
 
 
 def test_a_unit_without_a_record_is_made_although_its_data_are_stored(tmp_path):

@@ -152,7 +152,7 @@ def calibrations(source: CalibrationSource, scas: Sequence[int]) -> ImageProduct
         lengths=(len(scas),),
         coordinates=coordinates,
         # the largest values, in the dtype of a file and in that of the store, and a mask of them
-        bytes_per_unit=(700 if source.folder else 600) << 20,
+        bytes_per_unit=750 << 20,
         seconds_per_unit=15.0,
         stream=maker.stream,
     )

@@ -42,11 +42,13 @@ class WaitingMaker:
     """File that is created with each unit."""
     failing: tuple[int, ...] = ()
     """Units that raise an error."""
+    patience: float = 60.0
+    """Time after which waiting is an error, s."""
 
     def __call__(self, index: int) -> pd.DataFrame:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + self.patience
         while self.wait_for is not None and not self.wait_for.exists():
-            assert time.monotonic() < deadline, f"{self.wait_for} was not made in a minute"
+            assert time.monotonic() < deadline, f"{self.wait_for} was not made in {self.patience} s"
             time.sleep(0.02)
         if index in self.failing:
             raise ArithmeticError(f"unit {index} cannot be made")
@@ -229,11 +231,10 @@ def test_a_full_store_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr("romandask.engine.run_stages.refuse_full", full)
     stages = [
         stage_of("coadds/x", 1, WaitingMaker(failing=(0,))),
-        # read by another stage, the coadd is tried before the units of the truth index
-        stage_of("detections/x", 1, WaitingMaker(), (("coadds/x", "u0"),)),
-        stage_of("truth_index/x", 40, WaitingMaker(wait_for=tmp_path / "never")),
+        stage_of("truth_index/x", 40, WaitingMaker(wait_for=tmp_path / "never", patience=1.0)),
     ]
     with runner(1, 1.5) as execution:
+        # the coadd is tried three times, and other units have their turn between
         with pytest.raises(UserError, match="no space left"):
             logged_events(stages, tmp_path, execution)
         deadline = time.monotonic() + 30

@@ -149,7 +149,10 @@ def test_numbers_in_texts_and_in_integers_are_read(tmp_path):
             {"filters": ["H158", "F-184", "Y106"]},
             r"column 'filter' has 'F-184' in 1 of 3 rows, the first in row 1.*F158",
         ),
-        ({"filters": ["H158", "K213", "F106"]}, r"column 'filter' has no rows of F184, but of H158 \(1 rows\), K213 \(1 rows\), F106"),
+        (
+            {"filters": ["H158", "K213", "F106"]},
+            r"column 'filter' has no rows of F184, but of H158 \(1 rows\), K213 \(1 rows\), F106",
+        ),
     ],
 )
 def test_errors_name_column_and_row(tmp_path, changed, message):

@@ -126,7 +126,7 @@ def _visits_of(path: AnyPath) -> _Visits:
                         lacking[number] = list(own)
                         continue
                     units = {name: str(hdu.columns[column].unit or "") for name, column in columns.items()}
-                    table = Table.read(hdu, mask_invalid=False, unit_parse_strict="silent")
+                    table = Table.read(hdu, mask_invalid=False)
                     if len(table) != hdu.header["NAXIS2"]:
                         raise OSError(f"{len(table)} of {hdu.header['NAXIS2']} rows")
                     candidates[number] = _Visits(table=table, columns=columns, units=units)

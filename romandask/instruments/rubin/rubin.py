@@ -221,7 +221,7 @@ class RubinPointings(PointingSettings):
     """Source of Rubin's visits: an OpSim database, or a generated five-year cadence."""
 
     source: Literal["cadence", "opsim"] = "cadence"
-    path: str | None = Field(None, description="OpSim SQLite file, below `data`")
+    path: str | None = Field(None, description="OpSim SQLite file, or visit table in Parquet, below `data`")
     start: float = Field(60980.0, description="first night of the cadence, MJD")
     dither: str | None = Field(
         None,

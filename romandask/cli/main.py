@@ -306,12 +306,20 @@ def reference() -> None:
     print(data_product_reference(), end="")
 
 
+def _warning_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Return a warning as one line without the place in the code, which says nothing to a user."""
+    return f"warning: {message}\n" if category is UserWarning else f"warning: {category.__name__}: {message}\n"
+
+
 def main() -> None:
     """Run the command line."""
     # when reads of several chunks of a damaged file fail, one error is raised; asyncio logs the others
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     # and Python warns of the reads that had not started
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+    warnings.formatwarning = _warning_line
     try:
         app()
     except OSError as error:

@@ -47,6 +47,11 @@ class PointingSettings(Section):
     path: str | None = None
     """File with the list of visits, relative to `data`."""
 
+    @property
+    def read_options(self) -> dict[str, str | None]:
+        """Further arguments of the reader of `source`."""
+        return {}
+
 
 class InstrumentSettings(Section, ABC):
     """Base class of the section of an instrument in a pipeline."""

@@ -8,15 +8,16 @@ from __future__ import annotations
 import difflib
 import types
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from romandask.model.errors import UserError
+from romandask.model.filters import FilterNames, any_band, keys_by
 from romandask.model.sky import Region
 from romandask.model.tiles import TileGrid
 
@@ -50,6 +51,17 @@ def one_of(names: Iterable[str]) -> Callable[[str], str]:
             *others, last = (repr(name) for name in known)
             raise ValueError(f"Input should be {', '.join(others)} or {last} (found {value!r})")
         return value
+
+    return validator
+
+
+def band_in(bands: Collection[str], names: FilterNames) -> Callable[[str], str]:
+    """Return a validator that takes any name of some bands, and returns the band."""
+    known = one_of(bands)
+
+    def validator(name: str) -> str:
+        band = names.find(name, bands)
+        return band if band is not None and band in bands else known(name)
 
     return validator
 
@@ -229,7 +241,7 @@ class MatchSettings(Section):
         "clean",
         description="clean: unflagged objects with a true counterpart, brighter than the limits; all: every object",
     )
-    limits: dict[str, float] | None = Field(
+    limits: Annotated[dict[str, float] | None, BeforeValidator(keys_by(any_band))] = Field(
         None,
         description="faintest magnitude for each reference band (H158, i); if not set, where the counts fall to "
         "80% of a power law",
@@ -240,8 +252,12 @@ class MatchSettings(Section):
 class DifferenceSettings(Section):
     """Difference images of two surveys' coadds; made if the survey has both bands."""
 
-    template: str = Field("Y106", description="band of the template, the sharper survey's coadd that is subtracted")
-    science: str = Field("y", description="band of the science image, the coadd that the template is subtracted from")
+    template: Annotated[str, AfterValidator(any_band)] = Field(
+        "Y106", description="band of the template, the sharper survey's coadd that is subtracted"
+    )
+    science: Annotated[str, AfterValidator(any_band)] = Field(
+        "y", description="band of the science image, the coadd that the template is subtracted from"
+    )
     min_snr: float = Field(
         20.0,
         gt=0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ from romandask.products.units import Unit
 from romandask.stages.stage import Stage, SurveyContext
 from romandask.storage.paths import AnyPath, access_errors_explained, file_state, resolve_below
 
-READERS: dict[str, Callable[[AnyPath], pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
+READERS: dict[str, Callable[..., pd.DataFrame]] = {"obseq": obseq.read, "opsim": opsim.read}
 """Reader of each format of observing sequences, by the setting `source`."""
 CORNERS = tuple(f"{axis}_{k}" for k in range(4) for axis in ("ra", "dec"))
 """Columns with the corners of the footprint, degrees, in order along its outline."""
@@ -37,6 +37,10 @@ class PointingsSettings(Protocol):
     @property
     def path(self) -> str | None:
         """Path of the observing sequence, relative to the data folder."""
+
+    @property
+    def read_options(self) -> Mapping[str, str | None]:
+        """Further arguments of the reader, by name."""
 
 
 def pointings(
@@ -108,7 +112,9 @@ def pointings(
 def visits(
     instrument: Instrument, settings: PointingsSettings, data: AnyPath, region: Region, seed: int
 ) -> pd.DataFrame:
-    """Return all visits of the observing sequence, including those that do not touch the region.
+    """Return the visits of the observing sequence in the instrument's bands, wherever they point.
+
+    Visits in other bands may be among them; their values may be missing or wrong.
 
     Parameters are as in `pointings`.
 
@@ -123,7 +129,7 @@ def visits(
         raise UserError(f"{instrument.name}.pointings.path is needed with source: {settings.source}")
     file = resolve_below(data, settings.path)
     with access_errors_explained(file):
-        return READERS[settings.source](file)
+        return READERS[settings.source](file, bands=instrument.bands, **settings.read_options)
 
 
 def corners_of(table: pd.DataFrame) -> np.ndarray:

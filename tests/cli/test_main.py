@@ -4,6 +4,7 @@ import re
 
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from conftest import MINI, command
 from typer.testing import CliRunner
 
@@ -129,3 +130,22 @@ def test_the_survey_of_the_paper_is_planned_at_full_size(tmp_path, monkeypatch):
     assert done.returncode == 2
     assert "needs 1.8 GiB" in done.stderr
     assert ", or raise run.memory_limit" in done.stderr
+
+
+def test_a_warning_of_an_input_is_one_line(shared, tmp_path):
+    """The database has dithered places, which are not taken unless a setting says so."""
+    content = {
+        "name": "d",
+        "seed": 1,
+        "data": str(shared / "odd_inputs/opsim"),
+        "region": {"ra": [225.08, 225.09], "dec": [-40.0, -39.99]},
+        "rubin": {"bands": ["LSST_r"], "mode": "visits", "pointings": {"source": "opsim", "path": "dithered.db"}},
+    }
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump(content))
+    done = command("plan", "p.yaml", cwd=tmp_path)
+    assert done.returncode == 0
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stderr.startswith("warning: ")
+    assert "rubin.pointings.dither: descDithered" in done.stderr
+    done = command("plan", "p.yaml", "rubin.pointings.dither=descDithered", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -109,8 +109,8 @@ YAMLS = {
         ["dithers.H158", "-1"],
     ),
     "band of no visits": (
-        changed(rubin={"pointings": {"source": "cadence", "visits": {"I": 3}}}),
-        ["rubin.pointings.visits", "I"],
+        changed(rubin={"pointings": {"source": "cadence", "visits": {"X": 3}}}),
+        ["rubin.pointings.visits", "X"],
     ),
     "overlaps without an inside": (changed(coadds={"overlap": 600}), ["coadds", "pixels (1000)", "600"]),
     "drop of no size": (changed(coadds={"pixfrac": 0}), ["coadds.pixfrac", "0"]),
@@ -137,7 +137,14 @@ COMMANDS = {
     "whole sky in small cells": (["plan", "p.yaml", "region={ra: [0, 360], dec: [-90, 90]}"], ["cells", "truth.order"]),
     "tiles without number": (["plan", "p.yaml", "coadds.scale=1e-7"], ["tiles", "coadds.pixels"]),
     "pixfrac beyond one": (["plan", "p.yaml", "coadds.pixfrac=3"], ["coadds.pixfrac", "3"]),
-    "limit in small letters": (["plan", "p.yaml", "matches.limits={h158: 25}"], ["h158", "H158, i"]),
+    "limit in an unknown band": (["plan", "p.yaml", "matches.limits={h159: 25}"], ["h159", "H158, i"]),
+    "limit of a band twice": (["plan", "p.yaml", "matches.limits={H158: 25, F158: 26}"], ["H158", "F158", "twice"]),
+    "letter of two telescopes": (
+        ["plan", "p.yaml", "differences.science=Y"],
+        ["differences.science", "'Y'", "Y106", "y"],
+    ),
+    "filter that is not simulated": (["plan", "p.yaml", "roman.bands=[F213]"], ["roman.bands", "F213", "H158"]),
+    "dithers without a database": (["plan", "p.yaml", "rubin.pointings.dither=descDithered"], ["dither", "opsim"]),
     "folder as pipeline": (["plan", "folder"], ["folder", "no such pipeline"]),
     "store in the cloud": (["run", "p.yaml", "--store", "gs://bucket/s"], ["gs://bucket/s", "folder"]),
     "store of another scheme": (["run", "p.yaml", "--store", "http://host/s"], ["http://host/s", "folder"]),
@@ -172,7 +179,10 @@ OPSIM = {
     "database of other tables": ({"table": "visits"}, ["o.db", "observations"]),
     "database without a column": ({"airmass": None}, ["o.db", "airmass"]),
     "missing value": ({"airmass": [1.0, None]}, ["o.db", "airmass", "missing"]),
-    "text as number": ({"fieldRA": [53.0, "far"]}, ["o.db", "fieldRA"]),
+    "text as number": ({"fieldRA": [53.0, "far"]}, ["o.db", "fieldRA", "row 1", "'far'"]),
+    "text as identifier": ({"observationId": ["2024_0", "2024_1"]}, ["o.db", "observationId", "'2024_0'", "number"]),
+    "visits of other filters": ({"filter": ["g", "LSST_g"]}, ["o.db", "filter", "no rows of", "LSST_g (1 rows)"]),
+    "visits of unknown filters": ({"filter": ["i", "x"]}, ["o.db", "filter", "'x'", "LSST_i"]),
     "declination beyond the pole": ({"fieldDec": [-40.0, -140.0]}, ["o.db", "fieldDec", "-140"]),
     "negative exposure": ({"visitExposureTime": [30.0, -30.0]}, ["o.db", "visitExposureTime", "-30"]),
 }
@@ -184,7 +194,9 @@ SEQUENCES = {
     "sequence of text": ({"dec": ["south", "south"]}, ["o.fits", "dec"]),
     "sequence beyond the pole": ({"dec": [-40.0, -95.0]}, ["o.fits", "dec", "-95"]),
     "sequence of no time": ({"exptime": [140.0, 0.0]}, ["o.fits", "exptime", "0"]),
-    "sequence of unknown filters": ({"filter": ["H159", "H159"]}, ["H158"]),
+    "sequence of unknown filters": ({"filter": ["H159", "H159"]}, ["H159", "H158", "F158"]),
+    "sequence without a filter's rows": ({"filter": ["K213", "F129"]}, ["K213 (1 rows)", "no rows of", "H158"]),
+    "sequence of days": ({"date": [1.0, 2.0]}, ["o.fits", "date", "40000"]),
 }
 
 

@@ -62,7 +62,7 @@ def test_a_truncated_obseq_is_one_clear_error(shared, tmp_path, keep):
 
 
 def test_an_obseq_with_a_missing_column_or_a_nan(tmp_path):
-    columns = {name: [1.0, 2.0] for name in ("date", "exptime", "ra", "dec", "pa")}
+    columns = {name: [1.0, 2.0] for name in ("exptime", "ra", "dec", "pa")} | {"date": [62000.0, 62001.0]}
     path = tmp_path / "o.fits"
 
     def write(skip=None, **changed):

@@ -11,7 +11,7 @@ import galsim
 import galsim.roman
 import numpy as np
 import pandas as pd
-from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeInt, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.instrument import InstrumentContext, InstrumentSettings, PointingSettings, Publication
@@ -39,12 +39,15 @@ from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, Grid, PsfModel, model
 from romandask.kernels.rendering.psf_layout import PsfLayout
 from romandask.kernels.universe.bandpasses import galsim_roman_bandpasses, roman_bandpass
-from romandask.model.settings import distinct, one_of
+from romandask.model.filters import ROMAN, keys_by
+from romandask.model.settings import band_in, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
 from romandask.storage.paths import resolve_below
 
+Band = Annotated[str, AfterValidator(band_in(BANDS, ROMAN))]
+"""Name of a band, or another name of its filter."""
 _POSITION_PSF_PIXELS = 256
 """Side of the PSF at one position, pixels."""
 KNOT_SMOOTHING = 0.2
@@ -294,7 +297,7 @@ class RomanPointings(PointingSettings):
     source: Literal["plan", "obseq"] = "plan"
     path: str | None = Field(None, description="obseq FITS file, below `data`")
     start: float = Field(61541.0, ge=51544, le=88069, description="first day of the plan, MJD (years 2000 to 2100)")
-    dithers: dict[str, tuple[NonNegativeInt, ...]] = Field(
+    dithers: Annotated[dict[Band, tuple[NonNegativeInt, ...]], BeforeValidator(keys_by(ROMAN.find))] = Field(
         {name: band.dithers for name, band in BANDS.items()},
         description="dithers at every field, for each pass, by band",
     )
@@ -305,9 +308,7 @@ class RomanSettings(InstrumentSettings):
 
     every_band: ClassVar[tuple[str, ...]] = tuple(BANDS)
     usual_reference_band: ClassVar[str] = REFERENCE_BAND
-    bands: Annotated[tuple[Annotated[str, AfterValidator(one_of(BANDS))], ...], AfterValidator(distinct)] = Field(
-        tuple(BANDS), min_length=1
-    )
+    bands: Annotated[tuple[Band, ...], AfterValidator(distinct)] = Field(tuple(BANDS), min_length=1)
     pointings: RomanPointings = RomanPointings()
     detector: Literal["simple", "sca"] = Field(
         "simple", description="sky, Poisson and read noise alone, or every effect of each SCA (paper, section 4.4)"

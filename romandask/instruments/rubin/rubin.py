@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 import galsim
 import numpy as np
 import pandas as pd
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from romandask.instruments.exposure import WHOLE, Exposure, pixel_areas
 from romandask.instruments.instrument import InstrumentContext, InstrumentSettings, PointingSettings, Publication
@@ -23,7 +23,8 @@ from romandask.kernels.detectors.simple_detector import Detector
 from romandask.kernels.rendering.psf import BrightPsf, PsfModel
 from romandask.kernels.rendering.psf_layout import PsfLayout
 from romandask.kernels.universe.bandpasses import rubin_bandpass
-from romandask.model.settings import distinct, one_of
+from romandask.model.filters import RUBIN, keys_by
+from romandask.model.settings import band_in, distinct
 from romandask.model.sky import Region
 from romandask.model.spectra import Bandpass
 from romandask.products.images import ImageProduct
@@ -40,8 +41,8 @@ PUBLICATION = Publication(
 )
 
 
-Band = Annotated[str, AfterValidator(one_of(BANDS))]
-"""Name of a band."""
+Band = Annotated[str, AfterValidator(band_in(BANDS, RUBIN))]
+"""Name of a band, or another name of its filter."""
 
 
 @dataclass(frozen=True)
@@ -220,12 +221,28 @@ class RubinPointings(PointingSettings):
     """Source of Rubin's visits: an OpSim database, or a generated five-year cadence."""
 
     source: Literal["cadence", "opsim"] = "cadence"
-    path: str | None = Field(None, description="OpSim SQLite file, below `data`")
+    path: str | None = Field(None, description="OpSim SQLite file, or visit table in Parquet, below `data`")
     start: float = Field(60980.0, description="first night of the cadence, MJD")
-    visits: dict[Band, Annotated[int, Field(ge=0, le=10_000)]] = Field(
+    dither: str | None = Field(
+        None,
+        description="columns with the places of the visits, with source: opsim: `descDithered` for descDitheredRA, "
+        "descDitheredDec and descDitheredRotTelPos; `field`, or not set, for fieldRA and fieldDec",
+    )
+    visits: Annotated[dict[Band, Annotated[int, Field(ge=0, le=10_000)]], BeforeValidator(keys_by(RUBIN.find))] = Field(
         {name: band.visits for name, band in BANDS.items()}, description="mean visits of a point, by band"
     )
     seeing: float = Field(0.6, gt=0, description="median atmospheric FWHM at 500 nm and zenith, arcsec")
+
+    @model_validator(mode="after")
+    def _has_places(self) -> RubinPointings:
+        if self.dither is not None and self.source != "opsim":
+            raise ValueError(f"dither needs source: opsim (found source: {self.source})")
+        return self
+
+    @property
+    def read_options(self) -> dict[str, str | None]:
+        """The family of columns with the places, if the visits are those of a database."""
+        return {"dither": self.dither} if self.source == "opsim" else {}
 
 
 class RubinSettings(InstrumentSettings):

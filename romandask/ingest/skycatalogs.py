@@ -51,6 +51,8 @@ class Source:
     """Largest number of rows of a batch."""
     ignored: tuple[str, ...]
     """Object types of the configuration that are not read."""
+    components: bool = False
+    """Always False: a row is a galaxy or a star."""
 
     def batches(self) -> tuple[Batch, ...]:
         """Return the batches of all files."""
@@ -81,7 +83,7 @@ class Source:
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
-        return read_rows(batch, self.files[batch.source], self.mw_rv, len(self.edges) - 1)
+        return read_rows(batch, self.files[batch.source], self.mw_rv, self.edges)
 
 
 def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
@@ -113,12 +115,11 @@ def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
     parts = (*COMPONENTS, *(f"{component}_basic" for component in COMPONENTS))
     ignored = tuple(str(name) for name in types if name not in KINDS and name not in parts)
     if not files:
-        other = f"; object types {', '.join(ignored)} are not read" if ignored else ""
-        raise UserError(f"{folder}: holds no galaxy_<pixel>.parquet, pointsource or trilegal file{other}")
+        raise UserError(_why_no_files(folder, config, types, ignored))
     tophat = False
     for file in files.values():
         names = parquet.schema(file.path).names
-        check_columns(file, names)
+        check_columns(file)
         tophat |= any(f"sed_val_{c}" in names for c in COMPONENTS)
         if file.flux and identifier_column(file)[0] not in parquet.schema(file.flux).names:
             raise UserError(f"{file.flux}: column {identifier_column(file)[0]!r} is missing")
@@ -128,6 +129,25 @@ def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
         mw_rv = MW_RV
     edges = _tophat_edges(config, content) if tophat else ()
     return Source(files=files, edges=edges, mw_rv=mw_rv, rows=rows, ignored=ignored)
+
+
+def _why_no_files(folder: AnyPath, config: AnyPath, types: dict[str, Any], ignored: tuple[str, ...]) -> str:
+    """Return the message for a folder without a file of the object types that its configuration names."""
+    found = sorted(path.name for path in folder.iterdir() if path.suffix == ".parquet")
+    for kind, template in TEMPLATES.items():
+        present = [name for name in found if re.fullmatch(template, name)]
+        if present and not any(KINDS.get(str(name)) == kind for name in types):
+            return (
+                f"{config}: object_types names {', '.join(map(str, types))}, not {kind}, but the folder holds "
+                f"{present[0]}: add {kind} to object_types"
+            )
+    other = f"; object types {', '.join(ignored)} are not read" if ignored else ""
+    listed = f"{', '.join(found[:5])}{', ...' if len(found) > 5 else ''}" if found else "no .parquet file"
+    read = ", ".join(str(name) for name in types if name in KINDS) or "that are read"
+    return (
+        f"{folder}: holds no galaxy_<pixel>.parquet, pointsource or trilegal file of the object types {read} of "
+        f"{config.name} (found {listed}){other}"
+    )
 
 
 class _Loader(yaml.SafeLoader):

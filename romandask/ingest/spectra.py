@@ -11,6 +11,7 @@ import galsim
 import numpy as np
 from astropy.modeling.physical_models import BlackBody
 
+from romandask.ingest.rows import NEGATIVE, NO_LIGHT, NOT_A_NUMBER
 from romandask.model.errors import UserError
 from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
 from romandask.storage.paths import AnyPath, local_copy
@@ -131,12 +132,34 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
             continue
         try:
             local = local_copy(path)
-            with gzip.open(local, "rt") if local.suffix == ".gz" else open(local) as file:
-                wave, flambda = np.loadtxt(file, unpack=True)[:2]
-            library_from([name], [(wave, flambda)], np.array([400.0, 500.0]))
+            # a byte-order mark at the beginning is left out
+            with (
+                gzip.open(local, "rt", encoding="utf-8-sig")
+                if local.suffix == ".gz"
+                else open(local, encoding="utf-8-sig") as file
+            ):
+                wave, flambda = np.loadtxt(file, unpack=True, ndmin=2)[:2]
         except (OSError, EOFError, ValueError):
             reasons[name] = "SED file cannot be read"
+            continue
+        if fault := _fault(wave, flambda):
+            reasons[name] = fault
             continue
         labels.append(name)
         spectra.append((wave, flambda))
     return library_from(labels, spectra, grid), reasons
+
+
+def _fault(wave: np.ndarray, flambda: np.ndarray) -> str:
+    """Return why a spectrum cannot be used, or ""."""
+    if not (np.isfinite(wave).all() and np.isfinite(flambda).all()):
+        return "SED file: " + NOT_A_NUMBER
+    if (wave <= 0).any() or (np.diff(wave) < 0).any():
+        return "SED file: wavelengths do not increase"
+    if (flambda < 0).any():
+        return "SED file: " + NEGATIVE
+    try:
+        library_from([""], [(wave, flambda)], np.array([400.0, 500.0]))
+    except ValueError:
+        return "SED file: " + NO_LIGHT
+    return ""

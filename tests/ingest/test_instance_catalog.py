@@ -11,7 +11,8 @@ import pytest
 from read_source import assert_same_rows, read_all
 
 from romandask.ingest import instance_catalog
-from romandask.ingest.rows import MAX_ROWS, Batch, merge_components
+from romandask.ingest.components import merge_components
+from romandask.ingest.rows import MAX_ROWS, Batch
 from romandask.model.errors import UserError
 
 
@@ -106,8 +107,8 @@ def test_broken_lines_are_quarantined_and_counted(tmp_path):
         POINT + " 7": "too many fields (18, expected 17)",
         POINT.replace("10.0", "ten"): "ra is not a number",
         POINT.replace("10.0", "nan"): "position is not a number",
-        POINT.replace("-5.0", "-95.0"): "position is not a number",
-        POINT.replace("object 4", "object four"): "id is missing, negative or not an integer",
+        POINT.replace("-5.0", "-95.0"): "declination is beyond -90 to 90 degrees",
+        POINT.replace("object 4", "object four"): "id 'four' is not an integer",
         POINT.replace("20.0", "nan"): "magnorm is not a number",
         POINT.replace("20.0", "99"): "magnorm of 50 or more: no light",
         POINT.replace(".gz 0 0", ".gz 0.7 0"): "point source with a redshift is no star",

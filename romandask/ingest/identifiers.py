@@ -101,8 +101,8 @@ def _parsed(texts: np.ndarray, pattern: str) -> tuple[np.ndarray, np.ndarray]:
     if not len(texts):
         return np.empty(0, np.int64), np.empty(0, bool)
     found = pd.Series(texts, dtype=object).str.extract(f"^{pattern}$")[0]
-    bad = found.isna().to_numpy(bool)
-    digits = found.fillna("0").to_numpy(object)
+    bad = found.isna().to_numpy(bool, copy=True)
+    digits = found.fillna("0").to_numpy(object, copy=True)
     for row in np.flatnonzero(np.fromiter(map(len, digits), int, len(digits)) > _SAFE_DIGITS):
         magnitude = digits[row].lstrip("+-0") or "0"
         bad[row] = len(magnitude) > _SAFE_DIGITS + 1 or int(magnitude) > _LARGEST

@@ -109,7 +109,7 @@ class Source:
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return the rows of a batch in the normal form, one per object line.
 
-        The components of a galaxy are separate rows (see `romandask.ingest.rows.merge_components`).
+        The components of a galaxy are separate rows (see `romandask.ingest.components.merge_components`).
         """
         lines = lines_of_block(batch.path, batch.start, batch.stop)
         first = self.texts[batch.source].lines[batch.start // self.block]

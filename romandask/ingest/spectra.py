@@ -13,7 +13,7 @@ from astropy.modeling.physical_models import BlackBody
 
 from romandask.ingest.rows import NEGATIVE, NO_LIGHT, NOT_A_NUMBER
 from romandask.model.errors import UserError
-from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
+from romandask.model.spectra import MAGNORM_WAVE, SpectrumLibrary, default_grid, library_from
 from romandask.storage.paths import AnyPath, local_copy
 
 BLACKBODY = re.compile(r"blackbody_(\d{3,6})")
@@ -158,6 +158,8 @@ def _fault(wave: np.ndarray, flambda: np.ndarray) -> str:
         return "SED file: wavelengths do not increase"
     if (flambda < 0).any():
         return "SED file: " + NEGATIVE
+    if not wave[0] < MAGNORM_WAVE < wave[-1]:
+        return "SED file: " + NO_LIGHT
     try:
         library_from([""], [(wave, flambda)], np.array([400.0, 500.0]))
     except ValueError:

@@ -253,3 +253,68 @@ def test_opening_a_folder_reports_mistakes_in_it(shared, tmp_path):
         skycatalogs.open_source(folder)
     with pytest.raises(UserError, match="no such folder"):
         skycatalogs.open_source(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("ra", lambda column: column.astype(str), "column 'ra' holds text: expected number"),
+        (
+            "galaxy_id",
+            lambda column: column.astype(float) + 0.5,
+            r"column 'galaxy_id' \(for id\) holds .* 64-bit float",
+        ),
+        ("sed_val_disk", lambda column: column.map(len), "column 'sed_val_disk' holds number: expected lists"),
+    ],
+)
+def test_a_column_of_the_wrong_type_is_refused(shared, tmp_path, name, change, words):
+    copy_sample(shared, tmp_path, lambda frame: frame.assign(**{name: change(frame[name])}))
+    with pytest.raises(UserError, match=words):
+        skycatalogs.open_source(tmp_path)
+
+
+def test_units_of_columns_are_converted(shared, tmp_path):
+    copy_sample(shared, tmp_path, lambda frame: frame.assign(ra=np.radians(frame["ra"])))
+    path = tmp_path / "galaxy_9683.parquet"
+    content = pq.read_table(path)
+    number = content.column_names.index("ra")
+    pq.write_table(
+        content.set_column(number, pa.field("ra", pa.float64(), metadata={"unit": "rad"}), content["ra"]), path
+    )
+    expected = pq.read_table(shared / "skycatalogs_sample/galaxy_9683.parquet")["ra"].to_numpy()
+    np.testing.assert_allclose(read_all(skycatalogs.open_source(tmp_path))["ra"], expected, rtol=1e-12)
+
+
+def test_top_hat_spectra_that_cannot_be_used_are_quarantined(shared, tmp_path):
+    values = {
+        0: (3, np.nan),
+        1: (3, np.inf),
+        2: (3, -1e-3),
+        3: (slice(None), 0.0),
+        4: (slice(10, 20), 0.0),
+        5: (29, 0.0),
+    }
+
+    def change(frame):
+        lit = np.flatnonzero(np.isfinite(frame["disk_magnorm"]))
+        dark = np.flatnonzero(~np.isfinite(frame["bulge_magnorm"]))
+        for row, (place, value) in values.items():
+            frame.at[lit[row], "sed_val_disk"] = frame.at[lit[row], "sed_val_disk"].copy()
+            frame.at[lit[row], "sed_val_disk"][place] = value
+        frame.at[dark[-1], "sed_val_bulge"] = np.full(30, np.nan)
+        return frame.assign(lit=np.isfinite(frame["disk_magnorm"]))
+
+    copy_sample(shared, tmp_path, change)
+    frame = read_all(skycatalogs.open_source(tmp_path))
+    lit = pq.read_table(tmp_path / "galaxy_9683.parquet")["lit"].to_numpy()
+    no_light = "spectrum has no light at 500 nm, where magnorm is defined"
+    nan = "spectrum holds NaN or infinite values"
+    assert frame["reason"][lit].tolist()[:6] == [nan, nan, "spectrum is negative somewhere", no_light, no_light, ""]
+    assert (frame["reason"] != "").sum() == 5, "the spectrum of a component without light does not matter"
+
+
+def test_a_type_that_the_configuration_does_not_name_is_told(shared):
+    with pytest.raises(UserError, match=r"object_types names .*, not trilegal, but the folder holds trilegal_9812"):
+        skycatalogs.open_source(shared / "odd_inputs/sky/trilegal_not_in_config")
+    with pytest.raises(UserError, match="column 'ra' holds text"):
+        skycatalogs.open_source(shared / "odd_inputs/sky/badra")

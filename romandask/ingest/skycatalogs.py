@@ -20,7 +20,14 @@ from cdshealpix import from_ring
 
 from romandask.ingest import parquet
 from romandask.ingest.rows import COMPONENTS, MAX_ROWS, Batch, file_states
-from romandask.ingest.skycatalogs_rows import MW_RV, PixelFile, check_columns, identifier_column, read_rows
+from romandask.ingest.skycatalogs_rows import (
+    MW_RV,
+    PixelFile,
+    check_columns,
+    identifier_column,
+    read_magnitudes,
+    read_rows,
+)
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath
 
@@ -84,6 +91,19 @@ class Source:
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
         return read_rows(batch, self.files[batch.source], self.mw_rv, self.edges)
+
+    def trilegal_sample(self, rows: int) -> pd.DataFrame:
+        """Return about `rows` good TRILEGAL stars, the first of each file, with all magnitudes that the files have.
+
+        The columns are those of the normal form and <band>mag.
+        """
+        files = {name: file for name, file in self.files.items() if file.kind == "trilegal"}
+        parts = [pd.DataFrame()]
+        for name, file in files.items():
+            batch = Batch(file.path, 0, min(parquet.count(file.path), -(-rows // len(files))), name)
+            parts.append(self.read(batch).join(read_magnitudes(batch)))
+        stars = pd.concat(parts, ignore_index=True)
+        return stars[stars["reason"] == ""] if len(stars) else stars
 
 
 def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:

@@ -260,6 +260,13 @@ def _read_trilegal(names: list[str], batch: Batch, mw_rv: float) -> dict[str, An
     }
 
 
+def read_magnitudes(batch: Batch) -> pd.DataFrame:
+    """Return the magnitudes (<band>mag) of the TRILEGAL stars of a batch, in the bands that the file has."""
+    names = [f"{band}mag" for band in TRILEGAL_BANDS if f"{band}mag" in parquet.schema(batch.path).names]
+    table = parquet.read(batch.path, names, batch.start, batch.stop)
+    return pd.DataFrame({name: parquet.numbers(table[name]) for name in names})
+
+
 def _unique_over_files(file: PixelFile, ids: np.ndarray) -> np.ndarray:
     """Return identifiers that are unique over all files: TRILEGAL numbers the stars within each pixel."""
     if file.kind != "trilegal":

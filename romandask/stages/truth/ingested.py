@@ -101,7 +101,7 @@ class _ReadBatch:
         return pd.concat([frame[~valid].assign(_healpix_29=np.int64(-1)), indexed], ignore_index=True)
 
 
-def _sources_of(rows: TableProduct) -> tuple[Source, ...]:
+def sources_of(rows: TableProduct) -> tuple[Source, ...]:
     """Return the source catalogs of ingested rows."""
     assert isinstance(rows.make, _ReadBatch)
     return rows.make.sources
@@ -109,12 +109,12 @@ def _sources_of(rows: TableProduct) -> tuple[Source, ...]:
 
 def edges_of(rows: TableProduct) -> tuple[float, ...]:
     """Return the rest-frame edges, nm, of the top-hat bins of ingested rows; empty if no row has a top-hat spectrum."""
-    return next((source.edges for source in _sources_of(rows) if source.edges), ())
+    return next((source.edges for source in sources_of(rows) if source.edges), ())
 
 
 def source_rows(rows: TableProduct) -> int:
     """Return the number of rows of the source catalogs."""
-    counts = [source.count() for source in _sources_of(rows)]
+    counts = [source.count() for source in sources_of(rows)]
     return sum(count for count in counts if count is not None)
 
 

@@ -11,6 +11,7 @@ from romandask.model.settings import TruthSettings
 from romandask.model.sky import Region
 from romandask.stages.truth import ingested
 from romandask.stages.truth.catalogs import truth
+from romandask.stages.truth.colours import colour_note
 
 BANDS = {band: Rubin(RubinSettings()).bandpass(band) for band in "gi"}
 EVERYWHERE = Region(0, 360, -90, 90)
@@ -112,6 +113,18 @@ def test_objects_without_finite_fluxes_are_quarantined(tmp_path, monkeypatch):
     assert len(galaxies) == 0
     assert stars["id"].tolist() == [7]
     assert bad["reason"].tolist() == ["flux is not a number"] * 4
+
+
+def test_colours_of_trilegal_stars_are_compared_with_the_catalog(shared):
+    rubin = {band: Rubin(RubinSettings()).bandpass(band) for band in "ugrizy"}
+    settings = TruthSettings(source="skycatalogs", path="sky/trilegal_colours")
+    rows = ingested.ingested_rows(ingested.open_sources(settings, shared / "odd_inputs"))
+    note = colour_note(rows, rubin)
+    assert "u -0.70 (-2.09 to +0.18)" in note
+    assert "i " not in note.partition("range:")[2], "the magnitude in i is kept"
+    assert colour_note(rows, {"H158": rubin["i"]}) == ""
+    settings = TruthSettings(source="skycatalogs", path="sky/sedodd")
+    assert not colour_note(ingested.ingested_rows(ingested.open_sources(settings, shared / "odd_inputs")), rubin)
 
 
 def test_repeated_identifiers_of_the_samples_have_one_row(shared):

@@ -93,7 +93,8 @@ def open_table(path: AnyPath, wanted: set[str]) -> FitsTable:
                     "its own"
                 )
             if not meant:
-                raise UserError(f"{path}: holds no binary table")
+                found = ", ".join(type(hdu).__name__ for hdu in hdus)
+                raise UserError(f"{path}: holds no binary table (found {found})")
             hdu = tables[meant[0]]
             end = hdu.fileinfo()["datLoc"] + hdu.header["NAXIS1"] * hdu.header["NAXIS2"]
             size = path.stat().st_size
@@ -122,9 +123,9 @@ def _kind(hdu: fits.BinTableHDU, column: fits.Column) -> str:
     if letter in "PQ":
         return "lists of any length"
     if letter == "A":
-        # the shape of a column of texts is in TDIM alone
-        several = column.dim is not None and len(column.dim.strip("() ").split(",")) > 1
-        return "arrays of texts" if several else "text"
+        # TDIM of a column of texts is the length of a text, and then the shape
+        shape = str(column.dim or "").strip("() ").split(",")[1:]
+        return "arrays of texts" if any(int(size) != 1 for size in shape) else "text"
     if letter not in "BIJKED":
         return {"L": "truth values", "X": "bits"}.get(letter, "complex numbers")
     shape = stored.shape or (1,)
@@ -141,8 +142,8 @@ def _values(hdu: fits.BinTableHDU, column: str, start: int, stop: int) -> tuple[
     if null not in (None, ""):
         # TNULL is a value as stored, before TSCAL and TZERO
         missing = (rows.view(np.ndarray)[column].reshape(count, -1) == null).all(axis=1)
+    values = values.reshape(count)
     if values.dtype.kind not in "SU":
-        values = values.reshape(count)
         values = np.array(values.astype(values.dtype.newbyteorder("=")))
     return values, missing
 

@@ -258,6 +258,7 @@ def quarantine_reasons(frame: pd.DataFrame, edges: tuple[float, ...] = ()) -> di
             "no spectrum is named": _any(lit[c] & ~known[c] for c in COMPONENTS) | (star & (value["sed"] == "")),
             "no component has light": galaxy & ~_any(lit[c] for c in COMPONENTS),
             "magnorm is not a number": star & ~has_magnitude,
+            "a flux of the source is infinite": _any(np.isinf(frame[name].to_numpy()) for name in FLUX_COLUMNS),
             f"brighter than magnitude {MIN_MAGNITUDE:g}": _any(each < MIN_MAGNITUDE for each in magnitudes),
         }
 

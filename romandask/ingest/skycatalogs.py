@@ -24,7 +24,6 @@ from romandask.ingest.skycatalogs_rows import (
     MW_RV,
     PixelFile,
     check_columns,
-    identifier_column,
     read_magnitudes,
     read_rows,
 )
@@ -141,8 +140,6 @@ def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
         names = parquet.schema(file.path).names
         check_columns(file)
         tophat |= any(f"sed_val_{c}" in names for c in COMPONENTS)
-        if file.flux and identifier_column(file)[0] not in parquet.schema(file.flux).names:
-            raise UserError(f"{file.flux}: column {identifier_column(file)[0]!r} is missing")
     try:
         mw_rv = float(content["MW_extinction_values"]["r_v"]["value"])
     except (KeyError, TypeError, ValueError):

@@ -98,8 +98,7 @@ def check_columns(file: PixelFile) -> None:
     UserError
         If a column is missing, or if it holds something else or has a unit of another quantity.
     """
-    kinds = parquet.kinds(file.path)
-    names = list(kinds)
+    names = parquet.schema(file.path).names
     needed: list[tuple[str, ...]]
     if file.kind == "star":
         needed = [(name,) for name in STAR_COLUMNS]
@@ -116,13 +115,17 @@ def check_columns(file: PixelFile) -> None:
     for choices in needed:
         if not set(choices) & set(names):
             raise UserError(f"{file.path}: column {choices[0]!r} is missing (found {', '.join(names)})")
-    for name, found in kinds.items():
-        wanted = _wanted_kind(file, name)
-        if wanted and found not in wanted:
-            raise UserError(f"{file.path}: column {name!r} holds {found}: expected {wanted[0]}")
     factors(file.path, _columns_with_units(names), parquet.units(file.path))
     identifier, _ = identifier_column(file)
-    parquet.check_identifiers(file.path, identifier)
+    for path in (file.path, *((file.flux,) if file.flux else ())):
+        kinds = parquet.kinds(path)
+        if identifier not in kinds:
+            raise UserError(f"{path}: column {identifier!r} is missing (found {', '.join(kinds)})")
+        for name, found in kinds.items():
+            wanted = _wanted_kind(file, name)
+            if wanted and found not in wanted:
+                raise UserError(f"{path}: column {name!r} holds {found}: expected {wanted[0]}")
+        parquet.check_identifiers(path, identifier)
 
 
 def _wanted_kind(file: PixelFile, name: str) -> tuple[str, ...]:
@@ -131,7 +134,7 @@ def _wanted_kind(file: PixelFile, name: str) -> tuple[str, ...]:
         return ("text",) if file.kind == "trilegal" else ("number", "text")
     if name in TOPHAT_COLUMNS and file.kind == "galaxy":
         return ("lists",)
-    if name in NUMBER_COLUMNS[file.kind]:
+    if name in NUMBER_COLUMNS[file.kind] or name in FLUX_COLUMNS:
         return ("number",)
     texts = {n.format(c) for n in SED_NAMES for c in COMPONENTS} | {"sed_filepath", "object_type"}
     return ("text",) if name in texts else ()

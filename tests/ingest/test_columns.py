@@ -98,8 +98,10 @@ def test_a_unit_of_another_quantity_is_refused(tmp_path, name, unit, words):
 
 def test_columns_of_one_value_a_row_are_read_and_other_shapes_refused(tmp_path):
     content = star_table(id=np.array([[7], [8], [9]]), ra=np.array([[10.0], [11.0], [12.0]]))
+    content["name"] = np.array([["a"], ["b "], ["longer"]])
     content.write(tmp_path / "t.fits")
-    assert read(tmp_path / "t.fits")[["id", "ra"]].to_numpy().tolist() == [[7, 10], [8, 11], [9, 12]]
+    frame = read(tmp_path / "t.fits", STAR | {"sed": "name"})
+    assert frame[["id", "ra", "sed"]].to_numpy().tolist() == [[7, 10, "a"], [8, 11, "b"], [9, 12, "longer"]]
     lists = pa.array([[10.0], [11.0], None], pa.list_(pa.float64(), 1))
     pq.write_table(
         pa.table({**{n: star_table()[n] for n in ("id", "dec", "mag")}, "ra": lists}), tmp_path / "t.parquet"
@@ -111,6 +113,7 @@ def test_columns_of_one_value_a_row_are_read_and_other_shapes_refused(tmp_path):
             (np.array([True, False, True]), "holds truth values"),
             (np.array([1j, 2, 3]), "holds complex numbers"),
             (np.array(["10", "11", "x"]), "holds text: expected number"),
+            (np.array([["10", "11"]] * 3), "holds arrays of texts: expected number"),
         ]
     ):
         star_table(ra=values).write(tmp_path / f"{number}.fits")
@@ -139,6 +142,15 @@ def test_the_table_that_has_the_columns_is_read(tmp_path):
     fits.HDUList([empty, other, fits.table_to_hdu(star_table(dec=None))]).writeto(tmp_path / "none.fits")
     with pytest.raises(UserError, match=r"column 'dec' \(for dec\) is missing \(found id, ra, mag\)"):
         read(tmp_path / "none.fits")
+    fits.HDUList([empty, fits.ImageHDU(np.zeros((2, 2)))]).writeto(tmp_path / "image.fits")
+    with pytest.raises(UserError, match=r"holds no binary table \(found PrimaryHDU, ImageHDU\)"):
+        read(tmp_path / "image.fits")
+
+
+def test_an_infinite_flux_of_the_source_is_quarantined(tmp_path):
+    star_table(f=[1.0, np.inf, np.nan]).write(tmp_path / "t.fits")
+    frame = read(tmp_path / "t.fits", STAR | {"lsst_flux_r": "f"})
+    assert frame["reason"].tolist() == ["", "a flux of the source is infinite", ""]
 
 
 def test_right_ascensions_are_brought_into_a_circle_and_impossible_positions_quarantined(tmp_path):

@@ -273,6 +273,22 @@ def test_a_column_of_the_wrong_type_is_refused(shared, tmp_path, name, change, w
         skycatalogs.open_source(tmp_path)
 
 
+def test_a_flux_file_with_texts_is_refused(shared, tmp_path):
+    copy_sample(shared, tmp_path, lambda frame: frame)
+    fluxes = pq.read_table(shared / "skycatalogs_sample/galaxy_flux_9683.parquet").to_pandas()
+    fluxes["lsst_flux_g"] = "none"
+    fluxes.to_parquet(tmp_path / "galaxy_flux_9683.parquet")
+    with pytest.raises(UserError, match=r"galaxy_flux_9683\.parquet: column 'lsst_flux_g' holds text: expected number"):
+        skycatalogs.open_source(tmp_path)
+
+
+def test_a_byte_order_mark_in_a_configuration_is_left_out(shared, tmp_path):
+    copy_sample(shared, tmp_path, lambda frame: frame)
+    path = tmp_path / "skyCatalog.yaml"
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert skycatalogs.open_source(tmp_path).count() == 500
+
+
 def test_units_of_columns_are_converted(shared, tmp_path):
     copy_sample(shared, tmp_path, lambda frame: frame.assign(ra=np.radians(frame["ra"])))
     path = tmp_path / "galaxy_9683.parquet"

@@ -124,8 +124,8 @@ def _kind(hdu: fits.BinTableHDU, column: fits.Column) -> str:
         return "lists of any length"
     if letter == "A":
         # TDIM of a column of texts is the length of a text, and then the shape
-        shape = str(column.dim or "").strip("() ").split(",")[1:]
-        return "arrays of texts" if any(int(size) != 1 for size in shape) else "text"
+        sizes = str(column.dim or "").strip("() ").split(",")[1:]
+        return "arrays of texts" if any(int(size) != 1 for size in sizes) else "text"
     if letter not in "BIJKED":
         return {"L": "truth values", "X": "bits"}.get(letter, "complex numbers")
     shape = stored.shape or (1,)

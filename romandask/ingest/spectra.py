@@ -8,6 +8,7 @@ from pathlib import Path
 
 import astropy.units as u
 import galsim
+import h5py
 import numpy as np
 from astropy.modeling.physical_models import BlackBody
 
@@ -97,7 +98,8 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
     Parameters
     ----------
     folder : path
-        Folder of text files, plain or .gz, with the columns wavelength (nm) and f_lambda.
+        Folder of text files, plain or .gz, with the columns wavelength (nm) and f_lambda; or the file seds.hdf5 of
+        `romandask export truth`.
     names : list of str
         Paths of files relative to the folder, or blackbody_<K> for a blackbody of that temperature, which needs no
         file.
@@ -112,8 +114,10 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
     Raises
     ------
     UserError
-        If there is no such folder and a name is not that of a blackbody.
+        If there is no such folder and a name is not that of a blackbody, or the file is not as it was exported.
     """
+    if folder.is_file():
+        return _exported(folder, sorted(set(names)))
     if not folder.is_dir() and any(not BLACKBODY.fullmatch(name) for name in names):
         raise UserError(f"{folder}: no such folder; truth.seds must name the folder of spectra")
     labels, spectra, reasons = [], [], {}
@@ -165,3 +169,23 @@ def _fault(wave: np.ndarray, flambda: np.ndarray) -> str:
     except ValueError:
         return "SED file: " + NO_LIGHT
     return ""
+
+
+def _exported(path: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
+    """Return a library of the spectra with the given names in an exported HDF5 file, and why others cannot be read."""
+    try:
+        with h5py.File(local_copy(path)) as file:
+            wave, limits = file["wave"][:], file["limits"][:]
+            known = {name: row for row, name in enumerate(file["name"].asstr()[:])}
+            found = [name for name in names if name in known]
+            flambda = np.array([file["flambda"][known[name]] for name in found]).reshape(len(found), len(wave))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a file of spectra as `romandask export truth` writes it ({error}): name a folder of spectra"
+        ) from None
+    grid = default_grid()
+    if wave.shape != grid.shape or not np.allclose(wave, grid, rtol=1e-9):
+        raise UserError(f"{path}: data set wave is not romandask's grid: export the truth again")
+    rows = [known[name] for name in found]
+    reasons = {name: "SED not in the library" for name in names if name not in known}
+    return SpectrumLibrary(tuple(found), grid, flambda * (grid / MAGNORM_WAVE), limits[rows].reshape(-1, 2)), reasons

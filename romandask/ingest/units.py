@@ -66,7 +66,9 @@ def factors(path: AnyPath, columns: dict[str, str], units: dict[str, str]) -> di
 
 def _factor(text: str, wanted: u.UnitBase) -> float | None:
     """Return the factor from a unit to another, or None if there is none."""
-    for spelling in (text, text.lower(), _SPELLINGS.get(text.lower(), "")):
+    # astropy does not know 1/s/cm2, but 1/(s cm2)
+    inverse = f"1/({text[2:].replace('/', ' ')})" if text.startswith("1/") else ""
+    for spelling in (text, text.lower(), inverse, _SPELLINGS.get(text.lower(), "")):
         try:
             with warnings.catch_warnings():
                 # a unit with two slashes, for example

@@ -13,6 +13,7 @@ from read_source import read_all
 
 from romandask.ingest import table
 from romandask.ingest.identifiers import MISSING
+from romandask.ingest.units import factors
 from romandask.model.errors import UserError
 
 STAR = {"id": "id", "ra": "ra", "dec": "dec", "magnorm": "mag", "sed": "=blackbody_5800"}
@@ -76,6 +77,14 @@ def test_the_unit_of_a_parquet_field_is_converted(tmp_path):
     pq.write_table(pa.Table.from_arrays(values, schema=pa.schema(fields)), tmp_path / "t.parquet")
     frame = read(tmp_path / "t.parquet")
     assert frame[["ra", "dec"]].to_numpy().ravel().tolist() == [180.0, -3.0]
+
+
+@pytest.mark.parametrize("unit", ["1/s/cm2", "ph / (s cm2)", "s-1 cm-2", "ph/s/cm2", ""])
+def test_spellings_of_the_unit_of_fluxes(tmp_path, unit):
+    assert factors(tmp_path, {"lsst_flux_u": "f"}, {"f": unit}) == {}
+    assert factors(tmp_path, {"lsst_flux_u": "f", "magnorm": "m"}, {"f": "1/s/m2", "m": "mag(AB)"}) == {
+        "lsst_flux_u": pytest.approx(1e-4)
+    }
 
 
 @pytest.mark.parametrize(

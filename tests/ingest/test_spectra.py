@@ -8,7 +8,9 @@ import gzip
 import numpy as np
 import pytest
 
+from romandask.export.truth import write_spectra
 from romandask.ingest.spectra import read_folder
+from romandask.model.errors import UserError
 
 GOOD = "300 1\n400 1\n500 2\n600 1\n"
 
@@ -38,6 +40,21 @@ def test_unusable_spectra_have_a_reason(tmp_path, text, reason):
     library, reasons = read_folder(tmp_path, ["s", "good"])
     assert library.names == ("good",)
     assert reasons == {"s": reason}
+
+
+def test_exported_spectra_are_read_and_other_files_refused(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder/s").write_text(GOOD)
+    library, _ = read_folder(tmp_path / "folder", ["s", "blackbody_5000"])
+    write_spectra(tmp_path / "seds.hdf5", library, ())
+    again, reasons = read_folder(tmp_path / "seds.hdf5", ["s", "other"])
+    assert again.names == ("s",)
+    assert reasons == {"other": "SED not in the library"}
+    row = library.names.index("s")
+    np.testing.assert_allclose(again.photons[0], library.photons[row], rtol=1e-12)
+    assert again.limits.tolist() == [library.limits[row].tolist()]
+    with pytest.raises(UserError, match=r"folder/s: not a file of spectra as `romandask export truth` writes it"):
+        read_folder(tmp_path / "folder/s", ["s"])
 
 
 def test_a_byte_order_mark_is_left_out(tmp_path):

@@ -23,6 +23,7 @@ from romandask.model.errors import UserError
 from romandask.pipeline import Pipeline
 from romandask.products.memory import INTERPRETER
 from romandask.stage_graph import Selection, StageProduct, stage_products
+from romandask.stages.truth.colours import colour_note
 from romandask.stages.truth.ingested import source_rows
 from romandask.storage.checksums import write_checksums
 from romandask.storage.lock import locked
@@ -247,6 +248,8 @@ def ingest(survey: Survey, runner: Runner, reporter: Reporter) -> dict[str, int]
     failures = current_run.summary.failed
     if failures or counts["in"] != counts["out"] + counts["quarantined"]:
         raise RuntimeError(f"rows are missing: {counts}; failed units: {failures}")
+    if note := colour_note(survey.output("truth/ingested"), survey.bandpasses):
+        reporter.say(note)
     return counts
 
 

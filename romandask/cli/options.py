@@ -34,7 +34,7 @@ Spectra = Annotated[
         "--seds",
         metavar="FOLDER",
         parser=source_path,
-        help="Folder of the spectra that the catalog names; default: seds in the folder of the catalog.",
+        help="Folder of the spectra that the catalog names, or exported seds.hdf5; default: seds beside the catalog.",
     ),
 ]
 Order = Annotated[int, typer.Option("--order", min=3, max=12, help="HEALPix order of the partitions of the catalogs.")]

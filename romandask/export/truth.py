@@ -27,6 +27,9 @@ BLOCK_BYTES = 2880
 def export_truth(survey: Survey, folder: Path) -> list[Path]:
     """Write the truth of a stored survey as galaxies.fits, stars.fits and seds.hdf5.
 
+    The tables have the names of spectra as well as their numbers, so that `romandask ingest table` reads them again,
+    with seds.hdf5 as the spectra.
+
     Parameters
     ----------
     survey : Survey
@@ -57,7 +60,9 @@ def export_truth(survey: Survey, folder: Path) -> list[Path]:
     written = []
     for product in (catalogs.galaxies, catalogs.stars):
         path = folder / f"{product.stage.split('/')[1]}.fits"
-        write_table(path, product.schema, _partitions(product), len(product.column("ra")), n_bins)
+        named, length = _with_names(product.schema), max([1, *map(len, catalogs.library.names)])
+        parts = (_with_names_of(part, catalogs.library) for part in _partitions(product))
+        write_table(path, named, parts, len(product.column("ra")), n_bins, length)
         written.append(path)
     path = folder / "seds.hdf5"
     write_spectra(path, catalogs.library, catalogs.edges)
@@ -69,10 +74,30 @@ def _partitions(product: TableProduct) -> Iterator[pd.DataFrame]:
         yield product.load(index)
 
 
-def write_table(path: Path, schema: pa.Schema, parts: Iterable[pd.DataFrame], n_rows: int, n_bins: int) -> None:
+def _with_names(schema: pa.Schema) -> pa.Schema:
+    """Return the schema with the name of each spectrum (<column>_name) after its number."""
+    fields = []
+    for field in schema:
+        fields.append(field)
+        if field.name == "sed" or field.name.endswith("_sed"):
+            fields.append(pa.field(f"{field.name}_name", pa.string(), metadata={"description": "Name of the spectrum"}))
+    return pa.schema(fields)
+
+
+def _with_names_of(part: pd.DataFrame, library: SpectrumLibrary) -> pd.DataFrame:
+    """Return rows with the names of their spectra, "" for -1."""
+    # the last one is found by -1
+    names = np.array([*library.names, ""], object)
+    columns = [name for name in part.columns if name == "sed" or name.endswith("_sed")]
+    return part.assign(**{f"{name}_name": names[part[name].to_numpy(int)] for name in columns})
+
+
+def write_table(
+    path: Path, schema: pa.Schema, parts: Iterable[pd.DataFrame], n_rows: int, n_bins: int, text_length: int = 1
+) -> None:
     """Write a table as the first extension of a FITS file; one part is in memory at a time.
 
-    Units become TUNIT cards and descriptions become comments. Text columns are not supported: truth catalogs have none.
+    Units become TUNIT cards and descriptions become comments.
 
     Parameters
     ----------
@@ -86,6 +111,8 @@ def write_table(path: Path, schema: pa.Schema, parts: Iterable[pd.DataFrame], n_
         Number of rows of all parts.
     n_bins : int
         Length of the values of list columns; the file has no list columns if it is 0.
+    text_length : int
+        Length of the values of text columns, which are ASCII.
 
     Raises
     ------
@@ -93,7 +120,7 @@ def write_table(path: Path, schema: pa.Schema, parts: Iterable[pd.DataFrame], n_
         If the parts do not have `n_rows` rows.
     """
     columns = [field for field in schema if n_bins or not pa.types.is_list(field.type)]
-    dtype = np.dtype([_column_dtype(field, n_bins) for field in columns])
+    dtype = np.dtype([_column_dtype(field, n_bins, text_length) for field in columns])
     header = fits.BinTableHDU(np.zeros(0, dtype)).header
     header["NAXIS2"] = n_rows
     for number, field in enumerate(columns, start=1):
@@ -117,8 +144,8 @@ def write_table(path: Path, schema: pa.Schema, parts: Iterable[pd.DataFrame], n_
 def write_spectra(path: Path, library: SpectrumLibrary, edges: tuple[float, ...]) -> None:
     """Write a spectrum library as HDF5.
 
-    The file has the data sets wave (nm), flambda (spectrum, wave; 1 at 500 nm), name, and tophat_edges (nm) if there
-    are top-hat spectra.
+    The file has the data sets wave (nm), flambda (spectrum, wave; 1 at 500 nm), name, limits (spectrum, 2; shortest and
+    longest wavelength, nm), and tophat_edges (nm) if there are top-hat spectra.
 
     Parameters
     ----------
@@ -137,13 +164,17 @@ def write_spectra(path: Path, library: SpectrumLibrary, edges: tuple[float, ...]
         )
         file["flambda"].attrs["description"] = "rest-frame f_lambda over that at 500 nm; rows as *_sed number them"
         file["name"] = np.array(library.names, dtype=h5py.string_dtype())
+        file["limits"] = library.limits
+        file["limits"].attrs["unit"] = "nm"
         if edges:
             file["tophat_edges"] = np.array(edges)
             file["tophat_edges"].attrs["unit"] = "nm"
 
 
-def _column_dtype(field: pa.Field, n_bins: int) -> tuple[Any, ...]:
+def _column_dtype(field: pa.Field, n_bins: int, text_length: int) -> tuple[Any, ...]:
     """Return the big-endian entry of a column in a structured dtype."""
+    if pa.types.is_string(field.type):
+        return (field.name, f"S{text_length}")
     if pa.types.is_list(field.type):
         return (field.name, ">f4", (n_bins,))
     dtype = np.dtype(field.type.to_pandas_dtype())
@@ -162,7 +193,7 @@ def _records(part: pd.DataFrame, columns: list[pa.Field], dtype: np.dtype) -> np
             # FITS stores truth values as the letters T and F
             records[field.name].view("i1")[:] = np.where(values, ord("T"), ord("F"))
         elif len(part):
-            records[field.name] = values
+            records[field.name] = values.astype(bytes) if pa.types.is_string(field.type) else values
     return records
 
 

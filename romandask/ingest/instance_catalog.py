@@ -5,39 +5,45 @@ A file has a header of `key value` lines, `object` lines, and `includeobj` lines
 These files mirror the sky. Their gamma_2 is -shear_2 (GCR: shear_2_phosim), and their position angles run from north to
 west (imSim's instcat.py draws the direction 90 deg - angle from west); both signs are changed here. Axes are half-light
 radii, arcsec. The DC2 writers use the identifiers galaxy_id * 1024 + a code of the component
-(sims_GCRCatSimInterface); here the identifier is galaxy_id.
+(sims_GCRCatSimInterface); here the identifier is galaxy_id. Whether a catalog does so is decided once, over all its
+files: at least nine in ten of its components have the code of their kind.
 """
 
 from __future__ import annotations
 
-import gzip
-import os
-import threading
+import re
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from romandask.ingest.rows import DARK_MAGNORM, Batch, file_states, identifiers, normal_form, with_reasons
+from romandask.ingest.identifiers import INTEGER, MAX_SHOWN, identifiers
+from romandask.ingest.rows import DARK_MAGNORM, Batch, file_states, normal_form, with_reasons
+from romandask.ingest.text_blocks import MAX_LINE_BYTES, decoded, iterate_lines, lines_of_block, open_binary, unmarked
 from romandask.model.errors import UserError
-from romandask.storage.paths import AnyPath, file_state, local_copy
+from romandask.storage.paths import AnyPath
 
 BLOCK_BYTES = 16 << 20
 """Bytes of uncompressed text per batch; the lines of DC2 have 170 to 260 bytes."""
-MAX_LINE_BYTES = 1 << 16
-"""Length, bytes, up to which lines are read completely."""
 CODES = {"bulge": (97, 77), "disk": (107, 87), "knots": (127, 95)}
 """Codes that the DC2 writers (of cosmoDC2, and of its predecessor) add to 1024 galaxy_id, by component."""
+CODED_SHARE = 0.9
+"""Share of components with the code of their kind from which on a catalog has such codes. Other integers have it by
+chance in 1 of 500 cases; a catalog with codes may have a few broken lines."""
 SHAPE_PARAMETERS = {"point": 0, "sersic2d": 4, "knots": 4}
 """Number of parameters of each known shape."""
 NUMBERS = (
     "ra dec magnorm redshift gamma_1 gamma_2 kappa a b angle index internal_av internal_rv galactic_av galactic_rv"
 ).split()
 """Numbers of an object; `index` is the Sersic index, or the number of knots."""
+_COMPONENT = re.compile(
+    rb"^object[ \t]+(\S+)(?:[ \t]+\S+){10}[ \t]+(sersic2d|knots)(?:[ \t]+\S+){3}[ \t]+(\S+)",
+    re.MULTILINE | re.IGNORECASE,
+)
+"""Line of a bulge, a disk or knots, with its identifier, shape, and Sersic index or number of knots."""
 _DUST_LAWS = {"internal": ("ccm",), "galactic": ("ccm", "f99", "f19")}
 
 
@@ -53,6 +59,10 @@ class TextSummary:
     """Number of rows: lines that are objects or that are not understood."""
     objects: int
     """Number of object lines."""
+    components: int = 0
+    """Number of bulges, disks and knots."""
+    coded: int = 0
+    """Number of those whose identifier has the code of their kind."""
     header: dict[str, float | int | str] = field(default_factory=dict)
     """Header of the visit."""
     includes: tuple[str, ...] = ()
@@ -71,6 +81,14 @@ class Source:
     """Bytes of uncompressed text per batch."""
     edges: tuple[float, ...] = ()
     """Always empty: instance catalogs have no top-hat spectra."""
+    components: bool = True
+    """Always True: the components of a galaxy are rows of their own."""
+
+    @property
+    def coded(self) -> bool:
+        """Whether the identifiers of components are 1024 galaxy_id + code."""
+        components = sum(text.components for text in self.texts.values())
+        return components > 0 and sum(text.coded for text in self.texts.values()) >= CODED_SHARE * components
 
     def batches(self) -> tuple[Batch, ...]:
         """Return the batches of all files: blocks of the uncompressed text, in bytes."""
@@ -91,12 +109,12 @@ class Source:
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return the rows of a batch in the normal form, one per object line.
 
-        The components of a galaxy are separate rows (see `romandask.ingest.rows.merge_components`).
+        The components of a galaxy are separate rows (see `romandask.ingest.components.merge_components`).
         """
-        lines = _lines_of_block(batch.path, batch.start, batch.stop)
+        lines = lines_of_block(batch.path, batch.start, batch.stop)
         first = self.texts[batch.source].lines[batch.start // self.block]
         rows = [(first + number, line) for number, line in enumerate(lines) if _is_row(line)]
-        return _normal_form(batch.source, rows)
+        return _normal_form(batch.source, rows, self.coded)
 
 
 def open_source(path: AnyPath, block: int = BLOCK_BYTES) -> Source:
@@ -132,7 +150,7 @@ def open_source(path: AnyPath, block: int = BLOCK_BYTES) -> Source:
 def read_header(path: AnyPath) -> dict[str, float | int | str]:
     """Return the header of the visit: the `key value` lines before the first object."""
     header: dict[str, float | int | str] = {}
-    for line in _iterate_lines(path):
+    for line in iterate_lines(path):
         tokens = line.split()
         if tokens and tokens[0] == "object":
             break
@@ -159,29 +177,37 @@ def _is_row(line: str) -> bool:
 def _scan(path: AnyPath, block: int) -> TextSummary:
     """Return the summary of a text file, from one pass with one block in memory."""
     size, lines, rows, objects, newlines = 0, [], 0, 0, 0
+    codes = np.zeros(2, int)
     includes: list[str] = []
     rest = b""
     try:
-        with _open_binary(path) as file:
+        with open_binary(path) as file:
             while data := file.read(block):
                 if size == 0 and b"\0" in data[:MAX_LINE_BYTES]:
                     raise UserError(f"{path}: not text: an instance catalog is text or .gz")
                 lines.append(newlines + (0 if size == 0 or rest == b"" else 1))
+                if size == 0:
+                    # the rest of the block keeps its offsets: `size` counts the mark
+                    size, data = size + len(data) - len(unmarked(data)), unmarked(data)
                 size += len(data)
                 newlines += data.count(b"\n")
                 complete, newline, tail = (rest + data).rpartition(b"\n")
                 n_rows, n_objects, included = _count(complete + newline)
+                codes += _count_codes(complete)
                 rows, objects, includes = rows + n_rows, objects + n_objects, includes + included
                 rest = tail[-MAX_LINE_BYTES:]
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: cannot be read ({reason}): copy it again") from None
     n_rows, n_objects, included = _count(rest)
+    components, coded = (codes + _count_codes(rest)).tolist()
     return TextSummary(
         size=size,
         lines=tuple(lines),
         rows=rows + n_rows,
         objects=objects + n_objects,
+        components=components,
+        coded=coded,
         header=read_header(path),
         includes=tuple(includes + included),
     )
@@ -193,7 +219,7 @@ def _count(text: bytes) -> tuple[int, int, list[str]]:
     if objects == text.count(b"\n") + (not text.endswith(b"\n") and bool(text)):
         return objects, objects, []
     rows, objects, includes = 0, 0, []
-    for line in _decoded(text):
+    for line in decoded(text):
         tokens = line.split()
         rows += _is_row(line)
         objects += tokens[:1] == ["object"]
@@ -202,94 +228,20 @@ def _count(text: bytes) -> tuple[int, int, list[str]]:
     return rows, objects, includes
 
 
-def _decoded(data: bytes) -> list[str]:
-    """Return the lines of a text, which only newlines separate (str.splitlines accepts other characters as well)."""
-    lines = data.decode("utf-8", "replace").split("\n")
-    return lines if lines[-1] else lines[:-1]
+def _count_codes(text: bytes) -> tuple[int, int]:
+    """Return the number of components in complete lines, and of those that have the code of their kind."""
+    found = _COMPONENT.findall(text)
+    # by Sersic index; knots have their number there
+    kinds = {b"4": "bulge", b"4.0": "bulge", b"1": "disk", b"1.0": "disk"}
+    coded = 0
+    for identifier, shape, index in found:
+        codes = CODES["knots" if shape.lower() == b"knots" else kinds.get(index, "bulge")]
+        coded += identifier.isdigit() and int(identifier[-20:]) % 1024 in codes
+    return len(found), coded
 
 
-def _open_binary(path: AnyPath) -> Any:
-    """Open a file for reading; a .gz is recognised by its content and decompressed."""
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; truth.path must name an instance catalog below data")
-    local = local_copy(path)
-    with open(local, "rb") as file:
-        compressed = file.read(2) == b"\x1f\x8b"
-    return gzip.open(local, "rb") if compressed else open(local, "rb")
-
-
-def _iterate_lines(path: AnyPath) -> Iterator[str]:
-    with _open_binary(path) as file:
-        while line := file.readline(MAX_LINE_BYTES):
-            yield line.decode("utf-8", "replace")
-
-
-def _lines_of_block(path: AnyPath, start: int, stop: int) -> list[str]:
-    """Return the lines whose first byte is in the range from `start` to `stop` (exclusive)."""
-    before = max(start - 1, 0)
-    # read beyond the block, to the end of its last line
-    data = _bytes(path, before, stop - before + MAX_LINE_BYTES)
-    if start > 0:
-        # a line that starts before the block belongs to the previous block
-        end = data.find(b"\n", 0, stop - before)
-        if end < 0:
-            return []
-        before, data = before + end + 1, data[end + 1 :]
-    inside = stop - before
-    if inside <= 0:
-        return []
-    if not data[:inside].endswith(b"\n"):
-        end = data.find(b"\n", inside)
-        inside = end + 1 if end >= 0 else len(data)
-    return _decoded(data[:inside])
-
-
-@dataclass
-class _GzipReader:
-    """An open .gz that is read sequentially; the end of the text read so far is kept, because blocks overlap."""
-
-    key: tuple[AnyPath, int, int]
-    """Path, modification time (ns) and process."""
-    file: BinaryIO
-    offset: int = 0
-    """Offset of the next byte in the uncompressed text."""
-    tail: bytes = b""
-    """Text before `offset`."""
-
-    def read(self, start: int, length: int) -> bytes:
-        tail_start = self.offset - len(self.tail)
-        if not tail_start <= start <= self.offset:
-            self.file.seek(start)
-            self.offset, self.tail, tail_start = start, b"", start
-        kept = self.tail[start - tail_start :]
-        data = kept + self.file.read(max(length - len(kept), 0))
-        self.offset, self.tail = start + len(data), data[-2 * MAX_LINE_BYTES :]
-        return data[:length]
-
-
-_GZIP_LOCK = threading.Lock()
-_OPEN_GZIP: list[_GzipReader] = []
-"""The .gz that is open in this process, if any."""
-
-
-def _bytes(path: AnyPath, start: int, length: int) -> bytes:
-    """Return a range of bytes of the uncompressed text."""
-    with _open_binary(path) as file:
-        if not isinstance(file, gzip.GzipFile):
-            file.seek(start)
-            return file.read(length)
-    key = (path, file_state(path)[1], os.getpid())
-    with _GZIP_LOCK:
-        # one .gz stays open per process, so that the next block need not be decompressed from the beginning
-        if not _OPEN_GZIP or _OPEN_GZIP[0].key != key:
-            for reader in _OPEN_GZIP:
-                reader.file.close()
-            _OPEN_GZIP[:] = [_GzipReader(key, _open_binary(path))]
-        return _OPEN_GZIP[0].read(start, length)
-
-
-def _normal_form(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
-    """Return rows, given as line number and line, in the normal form."""
+def _normal_form(source: str, rows: list[tuple[int, str]], coded: bool) -> pd.DataFrame:
+    """Return rows, given as line number and line, in the normal form; `coded` is that of the source."""
     parsed = [_parse(line) for _, line in rows]
     fields = list(zip(*parsed, strict=True)) if parsed else [()] * (len(NUMBERS) + 4)
     id_text, shape, sed, reason = (np.array(values, object) for values in fields[:4])
@@ -310,8 +262,9 @@ def _normal_form(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
     dark = value["magnorm"] >= DARK_MAGNORM
     reason[point & dark & (reason == "")] = "magnorm of 50 or more: no light"
     magnorm = np.where(dark, np.inf, value["magnorm"])
+    ids, reason = _ids(id_text, component, reason, coded)
     columns: dict[str, Any] = {
-        "id": _ids(id_text, component),
+        "id": ids,
         "reason": reason,
         "ra": value["ra"],
         "dec": value["dec"],
@@ -341,16 +294,22 @@ def _normal_form(source: str, rows: list[tuple[int, str]]) -> pd.DataFrame:
     return with_reasons(normal_form(source, numbers, np.where(point, "star", "galaxy").astype(object), columns))
 
 
-def _ids(texts: np.ndarray, component: dict[str, np.ndarray]) -> np.ndarray:
-    """Return identifiers; those of components of a galaxy are turned into the identifier of the galaxy.
+def _ids(
+    texts: np.ndarray, component: dict[str, np.ndarray], reason: np.ndarray, coded: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return identifiers, those of components turned into the identifier of the galaxy, and reasons for quarantine.
 
-    They may be written as 1024 galaxy_id + code, or as galaxy_id_component as skyCatalogs does (translate_utils.py).
+    They may be written as 1024 galaxy_id + code (`coded`), or as galaxy_id_component as skyCatalogs does
+    (translate_utils.py).
     """
-    ids = identifiers(texts, r"(-?\d{1,18})(?:_(?:bulge|disk|knots))?")
-    for name, rows in component.items():
-        coded = rows & (ids >= 0) & np.isin(ids % 1024, CODES[name])
-        ids = np.where(coded, ids // 1024, ids)
-    return ids
+    found = identifiers(texts, INTEGER + "(?:_(?:bulge|disk|knots))?")
+    ids, reason = found.values, found.reason_after(reason)
+    for name, rows in component.items() if coded else ():
+        has_code = np.isin(ids % 1024, CODES[name])
+        for row in np.flatnonzero(rows & ~has_code & (reason == "")):
+            reason[row] = f"id {texts[row][:MAX_SHOWN]} lacks the code of {name}, which the catalog has elsewhere"
+        ids = np.where(rows & has_code & (ids >= 0), ids // 1024, ids)
+    return ids, reason
 
 
 def _parse(line: str) -> tuple[str, ...]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from astropy.table.meta import YamlParseError, get_header_from_yaml
 
-from romandask.ingest.rows import Batch, duplicate_rows, identifiers
+from romandask.ingest.identifiers import INTEGER, Identifiers, check_floats, identifiers
+from romandask.ingest.rows import MAX_ROWS, Batch
 from romandask.model.errors import UserError
-from romandask.storage.paths import AnyPath, file_state, local_copy
+from romandask.storage.paths import AnyPath, local_copy
 
 CHUNK = 20_000
 """Number of rows that are decoded at a time."""
@@ -56,19 +57,36 @@ def slices(path: AnyPath, key: str, rows: int) -> tuple[Batch, ...]:
 
 
 def read(path: AnyPath, columns: list[str], start: int, stop: int) -> pa.Table:
-    """Return the rows from `start` to `stop` (exclusive) of a file; lists are in single precision.
+    """Return the rows from `start` to `stop` (exclusive) of a file; masked values are null, lists in single precision.
 
     Raises
     ------
     UserError
         If a page is damaged or the file cannot be read.
     """
+    masks = _masks(schema(path), columns)
     parts = []
-    for offset, part in _pieces(path, columns, start, stop):
+    for offset, part in _pieces(path, [*columns, *masks.values()], start, stop):
         first, last = max(start - offset, 0), min(stop - offset, part.num_rows)
         if last > first:
-            parts.append(_with_float32_lists(pa.Table.from_batches([part.slice(first, last - first)])))
+            table = _without_masked(pa.Table.from_batches([part.slice(first, last - first)]), masks)
+            parts.append(_with_float32_lists(table.select(columns)))
     return pa.concat_tables(parts) if parts else schema(path).empty_table().select(columns)
+
+
+def _masks(found: pa.Schema, columns: list[str]) -> dict[str, str]:
+    """Return the columns with the masks of other columns, as astropy writes them for masked columns."""
+    names = {column: f"{column}.mask" for column in columns}
+    known = {field.name for field in found if pa.types.is_boolean(field.type)}
+    return {column: mask for column, mask in names.items() if mask in known}
+
+
+def _without_masked(table: pa.Table, masks: dict[str, str]) -> pa.Table:
+    """Return a table with null for the masked values."""
+    for column, mask in masks.items():
+        kept = pc.if_else(table[mask], pa.scalar(None, table[column].type), table[column])
+        table = table.set_column(table.column_names.index(column), table.schema.field(column), kept)
+    return table
 
 
 def _with_float32_lists(table: pa.Table) -> pa.Table:
@@ -79,35 +97,16 @@ def _with_float32_lists(table: pa.Table) -> pa.Table:
     return table.cast(pa.schema(fields), safe=False) if any(has_lists) else table
 
 
-@lru_cache(maxsize=4)
-def _duplicate_rows(path: AnyPath, modified: int, column: str, pattern: str) -> np.ndarray:
-    """Return the rows of a file with the identifier of an earlier row; `modified` (ns) keys the cache."""
-    total = count(path)
-    ids = np.empty(total, np.int64)
-    for offset, part in _pieces(path, [column], 0, total):
-        ids[offset : offset + part.num_rows] = integers(pa.chunked_array([part.column(0)]), pattern)
-    return duplicate_rows(ids)
-
-
-def is_duplicate(batch: Batch, column: str, pattern: str) -> np.ndarray:
-    """Return, for each row of a batch, whether an earlier row of its file has the same identifier.
-
-    Parameters
-    ----------
-    batch : Batch
-        Rows of a file.
-    column : str
-        Column of the identifiers.
-    pattern : str
-        Pattern of the identifiers (see `romandask.ingest.rows.identifiers`).
-    """
-    rows = _duplicate_rows(batch.path, file_state(batch.path)[1], column, pattern)
-    return np.isin(np.arange(batch.start, batch.stop), rows)
+def scalars(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a column whose values are lists of one value as these values, and any other column as it is."""
+    if pa.types.is_fixed_size_list(column.type) and column.type.list_size == 1:
+        return pc.list_element(column, 0)
+    return column
 
 
 def numbers(column: pa.ChunkedArray) -> np.ndarray:
     """Return a column as float64, with NaN for null."""
-    return np.asarray(pc.cast(column, pa.float64(), safe=False).to_numpy(), float)
+    return np.asarray(pc.cast(scalars(column), pa.float64(), safe=False).to_numpy(), float)
 
 
 def texts(column: pa.ChunkedArray) -> np.ndarray:
@@ -116,13 +115,59 @@ def texts(column: pa.ChunkedArray) -> np.ndarray:
     return np.asarray(pc.utf8_trim_whitespace(text).to_numpy(), object)
 
 
-def integers(column: pa.ChunkedArray, pattern: str) -> np.ndarray:
-    """Return a column of identifiers as int64 (see `romandask.ingest.rows.identifiers`), with -1 for null."""
+def identifiers_of(column: pa.ChunkedArray, pattern: str = INTEGER) -> Identifiers:
+    """Return a column as identifiers; `pattern` is that of texts (see `romandask.ingest.identifiers`)."""
+    column = scalars(column)
     if pa.types.is_integer(column.type):
-        return np.where(pc.is_null(column).to_numpy(), -1, identifiers(pc.fill_null(column, 0).to_numpy()))
+        return identifiers(pc.fill_null(column, 0).to_numpy(), missing=pc.is_null(column).to_numpy())
     if pa.types.is_floating(column.type):
-        return identifiers(numbers(column))
-    return identifiers(texts(column), pattern)
+        return identifiers(np.asarray(column.to_numpy()))
+    found = texts(column)
+    if pa.types.is_decimal(column.type):
+        found = np.array([text.rstrip("0").rstrip(".") if "." in text else text for text in found], object)
+    return identifiers(found, pattern)
+
+
+def check_identifiers(path: AnyPath, column: str) -> None:
+    """Raise a UserError if a column holds floats that cannot be identifiers."""
+    if not pa.types.is_floating(schema(path).field(column).type):
+        return
+    for start in range(0, count(path), MAX_ROWS):
+        part = read(path, [column], start, start + MAX_ROWS)
+        check_floats(path, column, scalars(part[column]).to_numpy())
+
+
+def kinds(path: AnyPath) -> dict[str, str]:
+    """Return what each column of a file holds: number, text, lists, or the name of another type."""
+    return {field.name: _kind(field.type) for field in schema(path)}
+
+
+def _kind(data_type: pa.DataType) -> str:
+    if pa.types.is_fixed_size_list(data_type) and data_type.list_size == 1:
+        data_type = data_type.value_type
+    if pa.types.is_dictionary(data_type):
+        data_type = data_type.value_type
+    numbers_like = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
+    if any(test(data_type) for test in numbers_like):
+        return "number"
+    if pa.types.is_string(data_type) or pa.types.is_large_string(data_type) or pa.types.is_string_view(data_type):
+        return "text"
+    if pa.types.is_list(data_type) or pa.types.is_large_list(data_type) or pa.types.is_fixed_size_list(data_type):
+        return "lists" if _kind(data_type.value_type) == "number" else str(data_type)
+    return str(data_type)
+
+
+def units(path: AnyPath) -> dict[str, str]:
+    """Return the unit of each column that has one, in its metadata or in that which astropy writes."""
+    found = schema(path)
+    out = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in found}
+    if header := (found.metadata or {}).get(b"table_meta_yaml"):
+        try:
+            described = get_header_from_yaml(header.decode().splitlines())["datatype"]
+        except (YamlParseError, ValueError, KeyError):
+            described = []
+        out |= {column["name"]: str(column["unit"]) for column in described if column.get("unit") is not None}
+    return {name: unit for name, unit in out.items() if unit}
 
 
 def float_lists(column: pa.ChunkedArray) -> np.ndarray:

@@ -13,6 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 import pandas as pd
 
+from romandask.ingest.identifiers import MISSING
+from romandask.model.spectra import MAGNORM_WAVE
 from romandask.storage.paths import AnyPath, file_state
 
 COMPONENTS = ("bulge", "disk", "knots")
@@ -31,6 +33,9 @@ MAX_KNOTS = 10_000
 """Largest number of knots of a galaxy."""
 MAX_AV = 100.0
 """Largest A_v, mag; towards the centre of the Galaxy it is 30."""
+NOT_A_NUMBER = "spectrum holds NaN or infinite values"
+NEGATIVE = "spectrum is negative somewhere"
+NO_LIGHT = "spectrum has no light at 500 nm, where magnorm is defined"
 
 FLOAT_COLUMNS = tuple(
     (
@@ -59,7 +64,7 @@ COLUMNS = (
 - `source`, `row`: file of the row, and number of the row or line in it, from 0.
 - `reason`: why the row is quarantined; "" for a good row.
 - `kind`: "galaxy" or "star". Stars have NaN in the columns of galaxies.
-- `ra`, `dec`: position as observed, degrees.
+- `ra`, `dec`: position as observed, degrees; a right ascension from -360 to 360 is brought into 0 to 360.
 - `size_*`: half-light radii along the axes before lensing, arcsec.
 - `position_angle_unlensed`: degrees east of north.
 - `shear_*`: lensing shear with GalSim's on-sky signs.
@@ -106,6 +111,10 @@ class Source(Protocol):
     def edges(self) -> tuple[float, ...]:
         """Rest-frame edges of the bins of top-hat spectra, nm; empty if no row has such a spectrum."""
 
+    @property
+    def components(self) -> bool:
+        """Whether rows of galaxies with the same identifier are components of one galaxy, not duplicates."""
+
     def batches(self) -> tuple[Batch, ...]:
         """Return the batches of the source, in order."""
 
@@ -151,6 +160,9 @@ def normal_form(source: str, row: np.ndarray, kind: str | np.ndarray, columns: d
     }
     for name in FLOAT_COLUMNS:
         out[name] = np.broadcast_to(np.asarray(columns.get(name, np.nan), float), count).copy()
+    # a right ascension of -30 is one of 330; beyond 360 degrees it is an error of the catalog
+    turned = np.abs(out["ra"]) <= 360
+    out["ra"][turned] = np.mod(out["ra"][turned], 360.0) % 360.0
     for component in COMPONENTS:
         value = out[f"{component}_magnorm"]
         # NaN, like inf, means that the component has no light
@@ -174,63 +186,23 @@ def empty_spectra(count: int) -> np.ndarray:
     return out
 
 
-def identifiers(values: np.ndarray, pattern: str = r"(-?\d{1,18})") -> np.ndarray:
-    """Return identifiers as int64.
-
-    Parameters
-    ----------
-    values : ndarray of number or str
-        Identifiers as read.
-    pattern : str
-        Regular expression that a text must match in full; its first group is the identifier.
-
-    Returns
-    -------
-    ndarray of int64
-        Identifiers, -1 where a value is missing, is not an integer or does not match.
-    """
-    values = np.asarray(values)
-    if values.dtype.kind in "iub":
-        return np.where(values > np.iinfo(np.int64).max, -1, values).astype(np.int64)
-    if values.dtype.kind == "f":
-        with np.errstate(invalid="ignore"):
-            whole = np.isfinite(values) & (values == np.floor(values)) & (np.abs(values) < 2.0**53)
-        return np.where(whole, np.where(whole, values, 0).astype(np.int64), -1)
-    digits = pd.Series(values, dtype=object).astype(str).str.extract(f"^{pattern}$")[0]
-    return digits.fillna("-1").to_numpy(str).astype(np.int64) if len(digits) else np.empty(0, np.int64)
-
-
-def duplicate_rows(ids: np.ndarray) -> np.ndarray:
-    """Return the numbers of the rows whose identifier occurs in an earlier row; negative ones are ignored."""
-    order = np.sort(ids)
-    values = np.unique(order[1:][order[1:] == order[:-1]])
-    rows = np.flatnonzero(np.isin(ids, values[values >= 0])) if len(values) else np.empty(0, np.int64)
-    first = np.unique(ids[rows], return_index=True)[1]
-    return np.delete(rows, first)
-
-
-def with_reasons(frame: pd.DataFrame, tophat_bins: int = 0, duplicate: np.ndarray | None = None) -> pd.DataFrame:
+def with_reasons(frame: pd.DataFrame, edges: tuple[float, ...] = ()) -> pd.DataFrame:
     """Return rows with `reason` filled in for those that must be quarantined; a reason that is already set is kept.
 
     Parameters
     ----------
     frame : DataFrame
         Rows in the normal form.
-    tophat_bins : int
-        Number of bins that a top-hat spectrum must have.
-    duplicate : ndarray of bool, optional
-        True where an earlier row of the file has the same identifier.
+    edges : tuple of float, nm
+        Rest-frame edges of the bins of top-hat spectra; empty if there are none.
     """
     reason = frame["reason"].to_numpy(object).copy()
-    for text, bad in quarantine_reasons(frame, tophat_bins).items():
+    for text, bad in quarantine_reasons(frame, edges).items():
         reason[np.asarray(bad, bool) & (reason == "")] = text
-    if duplicate is not None:
-        duplicate_text = np.where(frame["kind"] == "galaxy", "duplicate galaxy_id", "duplicate id")
-        reason = np.where(np.asarray(duplicate, bool) & (reason == ""), duplicate_text, reason)
     return frame.assign(reason=reason)
 
 
-def quarantine_reasons(frame: pd.DataFrame, tophat_bins: int = 0) -> dict[str, np.ndarray]:
+def quarantine_reasons(frame: pd.DataFrame, edges: tuple[float, ...] = ()) -> dict[str, np.ndarray]:
     """Return the reasons for quarantine, in order of precedence, each with the rows (bool) to which it applies."""
     value = {name: frame[name].to_numpy() for name in (*FLOAT_COLUMNS, "n_knots", "id", "sed", "ref_band")}
     galaxy = frame["kind"].to_numpy(object) == "galaxy"
@@ -239,22 +211,23 @@ def quarantine_reasons(frame: pd.DataFrame, tophat_bins: int = 0) -> dict[str, n
     shaped = {"bulge": lit["bulge"], "disk": lit["disk"] | lit["knots"]}
     with np.errstate(invalid="ignore", over="ignore"):
         inverse_magnification = (1 - value["convergence"]) ** 2 - value["shear_1"] ** 2 - value["shear_2"] ** 2
-        positioned = np.isfinite(value["ra"]) & np.isfinite(value["dec"]) & (np.abs(value["dec"]) <= 90)
         axes = {c: (value[f"size_{c}_true"], value[f"size_minor_{c}_true"]) for c in shaped}
         sized = {c: (a >= 0) & (b >= 0) & np.isfinite(a) & np.isfinite(b) for c, (a, b) in axes.items()}
         # the tolerance allows for sizes in single precision
         ordered = {c: b <= a * (1 + 1e-6) for c, (a, b) in axes.items()}
         own_dust = {"bulge": lit["bulge"], "disk": shaped["disk"]}
         lengths = {c: np.fromiter(map(len, frame[f"sed_val_{c}"]), int, len(frame)) for c in COMPONENTS}
+        faults = {c: _tophat_faults(frame[f"sed_val_{c}"], lengths[c], edges) for c in COMPONENTS}
         known = {c: (frame[f"{c}_sed"].to_numpy(object) != "") | (lengths[c] > 0) for c in COMPONENTS}
         has_magnitude = np.isfinite(value["magnorm"]) | (np.isfinite(value["ref_mag"]) & (value["ref_band"] != ""))
         dust = [value["MW_av"]] + [np.where(own_dust[c], value[f"{c}_av"], 0) for c in own_dust]
         magnitudes = [np.where(galaxy, value[f"{c}_magnorm"], 0) for c in COMPONENTS]
         magnitudes += [np.where(star, value[name], 0) for name in ("magnorm", "ref_mag")]
         return {
-            "id is missing, negative or not an integer": value["id"] < 0,
-            "position is not a number": ~positioned,
+            MISSING: value["id"] < 0,
+            "position is not a number": ~(np.isfinite(value["ra"]) & np.isfinite(value["dec"])),
             "right ascension is beyond -360 to 360 degrees": np.abs(value["ra"]) > 360,
+            "declination is beyond -90 to 90 degrees": np.abs(value["dec"]) > 90,
             "redshift is not a number": galaxy & (~np.isfinite(value["redshift"]) | (value["redshift"] < 0)),
             f"redshift above {MAX_REDSHIFT:g}": galaxy & (value["redshift"] > MAX_REDSHIFT),
             "shear or convergence beyond the weak regime": galaxy
@@ -279,109 +252,28 @@ def quarantine_reasons(frame: pd.DataFrame, tophat_bins: int = 0) -> dict[str, n
                 ]
             ),
             "spectrum has a wrong number of bins": _any(
-                (lengths[c] != 0) & (lengths[c] != tophat_bins) for c in COMPONENTS
+                (lengths[c] != 0) & (lengths[c] != max(len(edges) - 1, 0)) for c in COMPONENTS
             ),
+            **{text: _any(lit[c] & faults[c][text] for c in COMPONENTS) for text in faults["disk"]},
             "no spectrum is named": _any(lit[c] & ~known[c] for c in COMPONENTS) | (star & (value["sed"] == "")),
             "no component has light": galaxy & ~_any(lit[c] for c in COMPONENTS),
             "magnorm is not a number": star & ~has_magnitude,
+            "a flux of the source is infinite": _any(np.isinf(frame[name].to_numpy()) for name in FLUX_COLUMNS),
             f"brighter than magnitude {MIN_MAGNITUDE:g}": _any(each < MIN_MAGNITUDE for each in magnitudes),
         }
 
 
-def merge_components(frame: pd.DataFrame) -> pd.DataFrame:
-    """Merge the rows that describe components of the same galaxy into one row per galaxy.
-
-    Rows of galaxies with the same identifier are components of one galaxy. If several have the same component, all but
-    the first are quarantined. All rows of a galaxy are quarantined if they disagree in position (by more than
-    0.1 arcsec), redshift, lensing, position angle, dust of the Milky Way, or in the size and dust that disk and knots
-    share. Of stars with the same identifier, all but the first are quarantined.
-
-    Parameters
-    ----------
-    frame : DataFrame
-        Rows in the normal form.
-
-    Returns
-    -------
-    DataFrame
-        Merged and quarantined rows, with the additional column `n_rows`, the number of source rows that each stands
-        for. It is 1 for quarantined rows, so the number of input rows equals the sum of `n_rows` of the good rows plus
-        the number of quarantined rows.
-    """
-    frame = frame.reset_index(drop=True).assign(n_rows=np.int32(1))
-    good = frame["reason"] == ""
-    stars = frame.index[good & (frame["kind"] == "star")]
-    frame.loc[stars[frame.loc[stars, "id"].duplicated()], "reason"] = "duplicate id"
-    galaxies = frame[good & (frame["kind"] == "galaxy")]
-    several = galaxies[galaxies["id"].duplicated(keep=False)]
-    if not len(several):
-        return frame
-    lit = pd.DataFrame({c: np.isfinite(several[f"{c}_magnorm"]) for c in COMPONENTS}, index=several.index)
-    repeated = (lit & (lit.groupby(several["id"]).cumsum() > 1)).any(axis=1)
-    frame.loc[several.index[repeated], "reason"] = "a component of this galaxy is listed twice"
-    several, lit = several[~repeated], lit[~repeated]
-    several = several[several["id"].duplicated(keep=False)]
-    lit = lit.loc[several.index]
-    for text, bad in _disagreements(several, lit).items():
-        rows = bad.groupby(several["id"]).transform("any") & (frame.loc[several.index, "reason"] == "")
-        frame.loc[several.index[rows], "reason"] = text
-    several = several[frame.loc[several.index, "reason"] == ""]
-    if not len(several):
-        return frame
-    merged = _combined(several, lit.loc[several.index])
-    return pd.concat([frame.drop(several.index), merged]).sort_index().reset_index(drop=True)
-
-
-def _combined(several: pd.DataFrame, lit: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per galaxy: its first row, with the columns of each component from the row that has it."""
-    ids = several["id"]
-    first = several.loc[~ids.duplicated()].copy()
-    has_disk = lit["disk"].groupby(ids).transform("any")
-    # knots share shape and dust with the disk, so their values are used only if no row has a disk
-    shape = lit["disk"] | (lit["knots"] & ~has_disk)
-    owners = (
-        (lit["bulge"], "size_bulge_true size_minor_bulge_true bulge_magnorm bulge_av bulge_rv bulge_sed sed_val_bulge"),
-        (shape, "size_disk_true size_minor_disk_true disk_av disk_rv"),
-        (lit["disk"], "disk_magnorm disk_sed sed_val_disk"),
-        (lit["knots"], "knots_magnorm n_knots knots_sed sed_val_knots"),
-    )
-    row_of_id = pd.Series(first.index, index=first["id"])
-    for rows, names in owners:
-        chosen = several[rows]
-        chosen = chosen[~chosen["id"].duplicated()]
-        rows_of_galaxies = row_of_id[chosen["id"]].to_numpy()
-        for name in names.split():
-            first.loc[rows_of_galaxies, name] = chosen[name].to_numpy()
-    first["n_rows"] = ids.map(ids.value_counts())[first.index].astype(np.int32)
-    return first
-
-
-def _disagreements(several: pd.DataFrame, lit: pd.DataFrame) -> dict[str, pd.Series]:
-    """Return, by reason, the rows that differ from the first row of their galaxy."""
-
-    def differs(names: str, tolerance: float, among: pd.Series | None = None) -> pd.Series:
-        out = np.zeros(len(several), bool)
-        for name in names.split():
-            value = several[name] if among is None else several[name].where(among)
-            reference = value.groupby(several["id"]).transform("first")
-            out |= ((value - reference).abs() > tolerance * (1 + reference.abs())).to_numpy()
-        return pd.Series(out, several.index)
-
-    first = {name: several[name].groupby(several["id"]).transform("first") for name in ("ra", "dec")}
-    east = (several["ra"] - first["ra"] + 180) % 360 - 180
-    distance = np.hypot(east * np.cos(np.radians(several["dec"])), several["dec"] - first["dec"]) * 3600
-    angle = several["position_angle_unlensed"]
-    turn = (angle - angle.groupby(several["id"]).transform("first") + 90) % 180 - 90
-    disk = lit["disk"] | lit["knots"]
-    return {
-        "components of one id lie apart": distance > 0.1,
-        "components of one id differ in redshift": differs("redshift", 1e-5),
-        "components of one id differ in lensing": differs("shear_1 shear_2 convergence", 1e-5),
-        "components of one id differ in position angle": turn.abs() > 0.01,
-        "components of one id differ in dust of the Milky Way": differs("MW_av MW_rv", 1e-3),
-        "disk and knots differ in size": differs("size_disk_true size_minor_disk_true", 1e-4, disk),
-        "disk and knots differ in dust": differs("disk_av disk_rv", 1e-3, disk),
-    }
+def _tophat_faults(spectra: pd.Series, lengths: np.ndarray, edges: tuple[float, ...]) -> dict[str, np.ndarray]:
+    """Return the reasons why top-hat spectra cannot be used, each with the rows (bool) to which it applies."""
+    out = {text: np.zeros(len(spectra), bool) for text in (NOT_A_NUMBER, NEGATIVE, NO_LIGHT)}
+    rows = np.flatnonzero(lengths == len(edges) - 1) if edges else np.empty(0, int)
+    if len(rows):
+        values = np.stack(spectra.iloc[rows].to_list())
+        at_500 = values[:, np.clip(np.searchsorted(edges, MAGNORM_WAVE, side="right") - 1, 0, len(edges) - 2)]
+        out[NOT_A_NUMBER][rows] = ~np.isfinite(values).all(axis=1)
+        out[NEGATIVE][rows] = (values < 0).any(axis=1)
+        out[NO_LIGHT][rows] = ~(at_500 > 0)
+    return out
 
 
 def _any(conditions: Any) -> np.ndarray:

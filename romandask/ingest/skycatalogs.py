@@ -20,7 +20,13 @@ from cdshealpix import from_ring
 
 from romandask.ingest import parquet
 from romandask.ingest.rows import COMPONENTS, MAX_ROWS, Batch, file_states
-from romandask.ingest.skycatalogs_rows import MW_RV, PixelFile, check_columns, identifier_column, read_rows
+from romandask.ingest.skycatalogs_rows import (
+    MW_RV,
+    PixelFile,
+    check_columns,
+    read_magnitudes,
+    read_rows,
+)
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath
 
@@ -51,6 +57,8 @@ class Source:
     """Largest number of rows of a batch."""
     ignored: tuple[str, ...]
     """Object types of the configuration that are not read."""
+    components: bool = False
+    """Always False: a row is a galaxy or a star."""
 
     def batches(self) -> tuple[Batch, ...]:
         """Return the batches of all files."""
@@ -81,7 +89,20 @@ class Source:
 
     def read(self, batch: Batch) -> pd.DataFrame:
         """Return all rows of a batch in the normal form."""
-        return read_rows(batch, self.files[batch.source], self.mw_rv, len(self.edges) - 1)
+        return read_rows(batch, self.files[batch.source], self.mw_rv, self.edges)
+
+    def trilegal_sample(self, rows: int) -> pd.DataFrame:
+        """Return about `rows` good TRILEGAL stars, the first of each file, with all magnitudes that the files have.
+
+        The columns are those of the normal form and <band>mag.
+        """
+        files = {name: file for name, file in self.files.items() if file.kind == "trilegal"}
+        parts = [pd.DataFrame()]
+        for name, file in files.items():
+            batch = Batch(file.path, 0, min(parquet.count(file.path), -(-rows // len(files))), name)
+            parts.append(self.read(batch).join(read_magnitudes(batch)))
+        stars = pd.concat(parts, ignore_index=True)
+        return stars[stars["reason"] == ""] if len(stars) else stars
 
 
 def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
@@ -113,21 +134,37 @@ def open_source(folder: AnyPath, rows: int = MAX_ROWS) -> Source:
     parts = (*COMPONENTS, *(f"{component}_basic" for component in COMPONENTS))
     ignored = tuple(str(name) for name in types if name not in KINDS and name not in parts)
     if not files:
-        other = f"; object types {', '.join(ignored)} are not read" if ignored else ""
-        raise UserError(f"{folder}: holds no galaxy_<pixel>.parquet, pointsource or trilegal file{other}")
+        raise UserError(_why_no_files(folder, config, types, ignored))
     tophat = False
     for file in files.values():
         names = parquet.schema(file.path).names
-        check_columns(file, names)
+        check_columns(file)
         tophat |= any(f"sed_val_{c}" in names for c in COMPONENTS)
-        if file.flux and identifier_column(file)[0] not in parquet.schema(file.flux).names:
-            raise UserError(f"{file.flux}: column {identifier_column(file)[0]!r} is missing")
     try:
         mw_rv = float(content["MW_extinction_values"]["r_v"]["value"])
     except (KeyError, TypeError, ValueError):
         mw_rv = MW_RV
     edges = _tophat_edges(config, content) if tophat else ()
     return Source(files=files, edges=edges, mw_rv=mw_rv, rows=rows, ignored=ignored)
+
+
+def _why_no_files(folder: AnyPath, config: AnyPath, types: dict[str, Any], ignored: tuple[str, ...]) -> str:
+    """Return the message for a folder without a file of the object types that its configuration names."""
+    found = sorted(path.name for path in folder.iterdir() if path.suffix == ".parquet")
+    for kind, template in TEMPLATES.items():
+        present = [name for name in found if re.fullmatch(template, name)]
+        if present and not any(KINDS.get(str(name)) == kind for name in types):
+            return (
+                f"{config}: object_types names {', '.join(map(str, types))}, not {kind}, but the folder holds "
+                f"{present[0]}: add {kind} to object_types"
+            )
+    other = f"; object types {', '.join(ignored)} are not read" if ignored else ""
+    listed = f"{', '.join(found[:5])}{', ...' if len(found) > 5 else ''}" if found else "no .parquet file"
+    read = ", ".join(str(name) for name in types if name in KINDS) or "that are read"
+    return (
+        f"{folder}: holds no galaxy_<pixel>.parquet, pointsource or trilegal file of the object types {read} of "
+        f"{config.name} (found {listed}){other}"
+    )
 
 
 class _Loader(yaml.SafeLoader):

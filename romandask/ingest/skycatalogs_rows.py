@@ -13,7 +13,18 @@ import pandas as pd
 import pyarrow as pa
 
 from romandask.ingest import parquet
-from romandask.ingest.rows import COMPONENTS, FLUX_COLUMNS, MAX_ROWS, Batch, normal_form, with_reasons
+from romandask.ingest.identifiers import INTEGER
+from romandask.ingest.rows import (
+    COMPONENTS,
+    FLOAT_COLUMNS,
+    FLUX_COLUMNS,
+    MAX_ROWS,
+    TOPHAT_COLUMNS,
+    Batch,
+    normal_form,
+    with_reasons,
+)
+from romandask.ingest.units import factors
 from romandask.model.errors import UserError
 from romandask.storage.paths import AnyPath
 
@@ -40,10 +51,16 @@ TRILEGAL_COLUMNS = tuple("id ra dec av logT".split())
 """Required columns of TRILEGAL stars, in addition to one magnitude."""
 TRILEGAL_BANDS = "irgzyu"
 """Bands whose magnitude gives the flux of a TRILEGAL star, in order of preference."""
-INTEGER_ID = r"(-?\d{1,18})"
-"""Pattern of identifiers of galaxies and stars that are texts."""
-TRILEGAL_ID = r".*_hp(?:\d+)_(\d{1,12})"
+TRILEGAL_ID = r".*_hp(?:[0-9]+)_([0-9]{1,12})"
 """Pattern of TRILEGAL identifiers, which are texts: <source>_hp<pixel>_<number in the pixel>."""
+NUMBER_COLUMNS = {
+    "galaxy": {name for column in GALAXY_COLUMNS for name in ALTERNATIVE_NAMES.get(column, (column,))}
+    | set("shear_2 shear_2_phosim MW_rv knots_magnorm n_knots sersic_bulge sersic_disk".split())
+    | {*ALTERNATIVE_NAMES["position_angle_unlensed"], *ELLIPTICITIES},
+    "star": {"ra", "dec", "magnorm", "MW_av", "MW_rv"},
+    "trilegal": {"ra", "dec", "av", "logT", *(f"{band}mag" for band in TRILEGAL_BANDS)},
+}
+"""Columns with numbers, by kind of file."""
 MW_RV = 3.1
 """R_V of dust for which neither file nor configuration gives a value."""
 
@@ -69,25 +86,19 @@ class PixelFile:
 def identifier_column(file: PixelFile) -> tuple[str, str]:
     """Return the column of the identifiers of a file, and their pattern."""
     if file.kind == "galaxy":
-        return "galaxy_id", INTEGER_ID
-    return "id", TRILEGAL_ID if file.kind == "trilegal" else INTEGER_ID
+        return "galaxy_id", INTEGER
+    return "id", TRILEGAL_ID if file.kind == "trilegal" else INTEGER
 
 
-def check_columns(file: PixelFile, names: list[str]) -> None:
-    """Check that a file has all required columns.
-
-    Parameters
-    ----------
-    file : PixelFile
-        The file.
-    names : list of str
-        Columns of the file.
+def check_columns(file: PixelFile) -> None:
+    """Check that a file has all required columns, that they hold numbers or texts as they should, and their units.
 
     Raises
     ------
     UserError
-        If a column is missing.
+        If a column is missing, or if it holds something else or has a unit of another quantity.
     """
+    names = parquet.schema(file.path).names
     needed: list[tuple[str, ...]]
     if file.kind == "star":
         needed = [(name,) for name in STAR_COLUMNS]
@@ -104,9 +115,40 @@ def check_columns(file: PixelFile, names: list[str]) -> None:
     for choices in needed:
         if not set(choices) & set(names):
             raise UserError(f"{file.path}: column {choices[0]!r} is missing (found {', '.join(names)})")
+    factors(file.path, _columns_with_units(names), parquet.units(file.path))
+    identifier, _ = identifier_column(file)
+    for path in (file.path, *((file.flux,) if file.flux else ())):
+        kinds = parquet.kinds(path)
+        if identifier not in kinds:
+            raise UserError(f"{path}: column {identifier!r} is missing (found {', '.join(kinds)})")
+        for name, found in kinds.items():
+            wanted = _wanted_kind(file, name)
+            if wanted and found not in wanted:
+                raise UserError(f"{path}: column {name!r} holds {found}: expected {wanted[0]}")
+        parquet.check_identifiers(path, identifier)
 
 
-def read_rows(batch: Batch, file: PixelFile, mw_rv: float, tophat_bins: int) -> pd.DataFrame:
+def _wanted_kind(file: PixelFile, name: str) -> tuple[str, ...]:
+    """Return what a column may hold; empty for a column that is not read."""
+    if name == identifier_column(file)[0]:
+        return ("text",) if file.kind == "trilegal" else ("number", "text")
+    if name in TOPHAT_COLUMNS and file.kind == "galaxy":
+        return ("lists",)
+    if name in NUMBER_COLUMNS[file.kind] or name in FLUX_COLUMNS:
+        return ("number",)
+    texts = {n.format(c) for n in SED_NAMES for c in COMPONENTS} | {"sed_filepath", "object_type"}
+    return ("text",) if name in texts else ()
+
+
+def _columns_with_units(names: list[str]) -> dict[str, str]:
+    """Return the columns, of those with the given names, that may have units, by column of the normal form."""
+    choices = {name: ALTERNATIVE_NAMES.get(name, (name,)) for name in FLOAT_COLUMNS}
+    choices |= {"MW_av": ("MW_av", "av"), "ref_mag": tuple(f"{band}mag" for band in TRILEGAL_BANDS)}
+    found = {name: _first_present(names, *columns) for name, columns in choices.items()}
+    return {name: column for name, column in found.items() if column}
+
+
+def read_rows(batch: Batch, file: PixelFile, mw_rv: float, edges: tuple[float, ...]) -> pd.DataFrame:
     """Return all rows of a batch in the normal form.
 
     Parameters
@@ -117,19 +159,20 @@ def read_rows(batch: Batch, file: PixelFile, mw_rv: float, tophat_bins: int) -> 
         File of the batch.
     mw_rv : float
         R_V of the Milky Way if the file has no column for it.
-    tophat_bins : int
-        Number of bins that a top-hat spectrum must have.
+    edges : tuple of float, nm
+        Rest-frame edges of the bins of top-hat spectra; empty if there are none.
     """
     names = parquet.schema(file.path).names
     read = {"galaxy": _read_galaxies, "star": _read_stars, "trilegal": _read_trilegal}[file.kind]
     columns = read(names, batch, mw_rv)
-    duplicate = parquet.is_duplicate(batch, *identifier_column(file))
+    for name, factor in factors(file.path, _columns_with_units(names), parquet.units(file.path)).items():
+        columns[name] = columns[name] * factor
     if file.flux:
         columns |= _read_fluxes(file, batch, columns["id"])
     kind = "galaxy" if file.kind == "galaxy" else "star"
     columns["id"] = _unique_over_files(file, columns["id"])
     frame = normal_form(batch.source, np.arange(batch.start, batch.stop), kind, columns)
-    return with_reasons(frame, tophat_bins, duplicate)
+    return with_reasons(frame, edges)
 
 
 def _first_present(names: list[str], *choices: str) -> str | None:
@@ -152,13 +195,13 @@ def _read_galaxies(names: list[str], batch: Batch, mw_rv: float) -> dict[str, An
     wanted = {"galaxy_id", *plain.values(), *tophat.values(), *(name for name in named.values() if name)}
     table = parquet.read(batch.path, sorted(wanted), batch.start, batch.stop)
     out: dict[str, Any] = {name: parquet.numbers(table[column]) for name, column in plain.items()}
-    out["id"] = parquet.integers(table["galaxy_id"], INTEGER_ID)
+    ids = parquet.identifiers_of(table["galaxy_id"])
     out |= {f"sed_val_{c}": parquet.float_lists(table[name]) for c, name in tophat.items()}
     out |= {f"{c}_sed": parquet.texts(table[name]) for c, name in named.items() if name}
     if "shear_2" not in out:
         # GCR: shear_2_phosim = -shear_2
         out["shear_2"] = -out["shear_2_phosim"]
-    reason = np.full(len(table), "", object)
+    out["id"], reason = ids.values, ids.reason
     for component, index in (("bulge", 4), ("disk", 1)):
         if (name := f"sersic_{component}") in out:
             unexpected = np.isfinite(out[f"{component}_magnorm"]) & (out[name] != index)
@@ -189,10 +232,10 @@ def _read_stars(names: list[str], batch: Batch, mw_rv: float) -> dict[str, Any]:
     wanted = [*STAR_COLUMNS, *(name for name in ("object_type", "MW_rv") if name in names)]
     table = parquet.read(batch.path, wanted, batch.start, batch.stop)
     out: dict[str, Any] = {name: parquet.numbers(table[name]) for name in ("ra", "dec", "magnorm", "MW_av")}
-    out["id"] = parquet.integers(table["id"], INTEGER_ID)
+    ids = parquet.identifiers_of(table["id"])
     out["sed"] = parquet.texts(table["sed_filepath"])
     out["MW_rv"] = parquet.numbers(table["MW_rv"]) if "MW_rv" in names else np.full(len(table), mw_rv)
-    reason = np.full(len(table), "", object)
+    out["id"], reason = ids.values, ids.reason
     if "object_type" in names:
         reason[parquet.texts(table["object_type"]) != "star"] = "object_type is not star"
     return out | {"reason": reason}
@@ -203,7 +246,8 @@ def _read_trilegal(names: list[str], batch: Batch, mw_rv: float) -> dict[str, An
     band = next(band for band in TRILEGAL_BANDS if f"{band}mag" in names)
     table = parquet.read(batch.path, [*TRILEGAL_COLUMNS, f"{band}mag"], batch.start, batch.stop)
     out: dict[str, Any] = {name: parquet.numbers(table[name]) for name in ("ra", "dec")}
-    out["id"] = parquet.integers(table["id"], TRILEGAL_ID)
+    ids = parquet.identifiers_of(table["id"], TRILEGAL_ID)
+    out["id"] = ids.values
     with np.errstate(over="ignore"):
         kelvin = 10 ** parquet.numbers(table["logT"])
     good = (kelvin >= 500) & (kelvin < 1e6)
@@ -215,8 +259,15 @@ def _read_trilegal(names: list[str], batch: Batch, mw_rv: float) -> dict[str, An
         "ref_band": f"lsst_{band}",
         "MW_av": parquet.numbers(table["av"]),
         "MW_rv": MW_RV,
-        "reason": np.where(good, "", "effective temperature is not a number").astype(object),
+        "reason": ids.reason_after(np.where(good, "", "effective temperature is not a number")),
     }
+
+
+def read_magnitudes(batch: Batch) -> pd.DataFrame:
+    """Return the magnitudes (<band>mag) of the TRILEGAL stars of a batch, in the bands that the file has."""
+    names = [f"{band}mag" for band in TRILEGAL_BANDS if f"{band}mag" in parquet.schema(batch.path).names]
+    table = parquet.read(batch.path, names, batch.start, batch.stop)
+    return pd.DataFrame({name: parquet.numbers(table[name]) for name in names})
 
 
 def _unique_over_files(file: PixelFile, ids: np.ndarray) -> np.ndarray:
@@ -240,7 +291,7 @@ def _read_fluxes(file: PixelFile, batch: Batch, ids: np.ndarray) -> dict[str, np
     def read_slice(start: int, stop: int) -> pd.DataFrame:
         table: pa.Table = parquet.read(path, [column, *names], start, stop)
         values = {name: parquet.numbers(table[name]).astype(np.float32) for name in names}
-        index = parquet.integers(table[column], pattern)
+        index = parquet.identifiers_of(table[column], pattern).values
         return pd.DataFrame(values, index=index).loc[~pd.Index(index).duplicated() & (index >= 0)]
 
     same_rows = read_slice(batch.start, min(batch.stop, total))

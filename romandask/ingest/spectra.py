@@ -8,11 +8,13 @@ from pathlib import Path
 
 import astropy.units as u
 import galsim
+import h5py
 import numpy as np
 from astropy.modeling.physical_models import BlackBody
 
+from romandask.ingest.rows import NEGATIVE, NO_LIGHT, NOT_A_NUMBER
 from romandask.model.errors import UserError
-from romandask.model.spectra import SpectrumLibrary, default_grid, library_from
+from romandask.model.spectra import MAGNORM_WAVE, SpectrumLibrary, default_grid, library_from
 from romandask.storage.paths import AnyPath, local_copy
 
 BLACKBODY = re.compile(r"blackbody_(\d{3,6})")
@@ -96,7 +98,8 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
     Parameters
     ----------
     folder : path
-        Folder of text files, plain or .gz, with the columns wavelength (nm) and f_lambda.
+        Folder of text files, plain or .gz, with the columns wavelength (nm) and f_lambda; or the file seds.hdf5 of
+        `romandask export truth`.
     names : list of str
         Paths of files relative to the folder, or blackbody_<K> for a blackbody of that temperature, which needs no
         file.
@@ -111,8 +114,10 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
     Raises
     ------
     UserError
-        If there is no such folder and a name is not that of a blackbody.
+        If there is no such folder and a name is not that of a blackbody, or the file is not as it was exported.
     """
+    if folder.is_file():
+        return _exported(folder, sorted(set(names)))
     if not folder.is_dir() and any(not BLACKBODY.fullmatch(name) for name in names):
         raise UserError(f"{folder}: no such folder; truth.seds must name the folder of spectra")
     labels, spectra, reasons = [], [], {}
@@ -131,12 +136,56 @@ def read_folder(folder: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dic
             continue
         try:
             local = local_copy(path)
-            with gzip.open(local, "rt") if local.suffix == ".gz" else open(local) as file:
-                wave, flambda = np.loadtxt(file, unpack=True)[:2]
-            library_from([name], [(wave, flambda)], np.array([400.0, 500.0]))
+            # a byte-order mark at the beginning is left out
+            with (
+                gzip.open(local, "rt", encoding="utf-8-sig")
+                if local.suffix == ".gz"
+                else open(local, encoding="utf-8-sig") as file
+            ):
+                wave, flambda = np.loadtxt(file, unpack=True, ndmin=2)[:2]
         except (OSError, EOFError, ValueError):
             reasons[name] = "SED file cannot be read"
+            continue
+        if fault := _fault(wave, flambda):
+            reasons[name] = fault
             continue
         labels.append(name)
         spectra.append((wave, flambda))
     return library_from(labels, spectra, grid), reasons
+
+
+def _fault(wave: np.ndarray, flambda: np.ndarray) -> str:
+    """Return why a spectrum cannot be used, or ""."""
+    if not (np.isfinite(wave).all() and np.isfinite(flambda).all()):
+        return "SED file: " + NOT_A_NUMBER
+    if (wave <= 0).any() or (np.diff(wave) < 0).any():
+        return "SED file: wavelengths do not increase"
+    if (flambda < 0).any():
+        return "SED file: " + NEGATIVE
+    if not wave[0] < MAGNORM_WAVE < wave[-1]:
+        return "SED file: " + NO_LIGHT
+    try:
+        library_from([""], [(wave, flambda)], np.array([400.0, 500.0]))
+    except ValueError:
+        return "SED file: " + NO_LIGHT
+    return ""
+
+
+def _exported(path: AnyPath, names: list[str]) -> tuple[SpectrumLibrary, dict[str, str]]:
+    """Return a library of the spectra with the given names in an exported HDF5 file, and why others cannot be read."""
+    try:
+        with h5py.File(local_copy(path)) as file:
+            wave, limits = file["wave"][:], file["limits"][:]
+            known = {name: row for row, name in enumerate(file["name"].asstr()[:])}
+            found = [name for name in names if name in known]
+            flambda = np.array([file["flambda"][known[name]] for name in found]).reshape(len(found), len(wave))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a file of spectra as `romandask export truth` writes it ({error}): name a folder of spectra"
+        ) from None
+    grid = default_grid()
+    if wave.shape != grid.shape or not np.allclose(wave, grid, rtol=1e-9):
+        raise UserError(f"{path}: data set wave is not romandask's grid: export the truth again")
+    rows = [known[name] for name in found]
+    reasons = {name: "SED not in the library" for name in names if name not in known}
+    return SpectrumLibrary(tuple(found), grid, flambda * (grid / MAGNORM_WAVE), limits[rows].reshape(-1, 2)), reasons

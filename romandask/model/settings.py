@@ -105,7 +105,9 @@ class TruthSettings(Section):
     path: str | None = Field(None, description="folder or file of the source catalog; relative to `data`")
     galaxy_table: TableSettings | None = Field(None, description="table of galaxies, with source: table")
     star_table: TableSettings | None = Field(None, description="table of stars, with source: table")
-    seds: str | None = Field(None, description="folder of the spectra named in the catalog; relative to `data`")
+    seds: str | None = Field(
+        None, description="folder of the spectra named in the catalog, or an exported seds.hdf5; relative to `data`"
+    )
     order: int = Field(8, ge=3, le=12, description="HEALPix order of the catalog partitions")
     margin: float = Field(
         20.0, ge=0, le=3600, description="distance outside the region to which objects are kept, arcsec"

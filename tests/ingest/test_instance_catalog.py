@@ -11,7 +11,8 @@ import pytest
 from read_source import assert_same_rows, read_all
 
 from romandask.ingest import instance_catalog
-from romandask.ingest.rows import MAX_ROWS, Batch, merge_components
+from romandask.ingest.components import merge_components
+from romandask.ingest.rows import MAX_ROWS, Batch
 from romandask.model.errors import UserError
 
 
@@ -106,8 +107,8 @@ def test_broken_lines_are_quarantined_and_counted(tmp_path):
         POINT + " 7": "too many fields (18, expected 17)",
         POINT.replace("10.0", "ten"): "ra is not a number",
         POINT.replace("10.0", "nan"): "position is not a number",
-        POINT.replace("-5.0", "-95.0"): "position is not a number",
-        POINT.replace("object 4", "object four"): "id is missing, negative or not an integer",
+        POINT.replace("-5.0", "-95.0"): "declination is beyond -90 to 90 degrees",
+        POINT.replace("object 4", "object four"): "id 'four' is not an integer",
         POINT.replace("20.0", "nan"): "magnorm is not a number",
         POINT.replace("20.0", "99"): "magnorm of 50 or more: no light",
         POINT.replace(".gz 0 0", ".gz 0.7 0"): "point source with a redshift is no star",
@@ -242,3 +243,48 @@ def test_batches_of_a_large_file_have_a_bounded_number_of_rows(instances, tmp_pa
     assert 50_000 < len(first) <= MAX_ROWS
     following = source.read(Batch(path, source.block, source.block + 1000, batches[1].key))
     assert following["row"].iloc[0] == len(first)
+
+
+@pytest.mark.parametrize("block", [200, 1 << 20])
+def test_a_byte_order_mark_is_left_out(tmp_path, block):
+    text = "\n".join([POINT, BULGE, DISK, POINT.replace("object 4", "object 5")]) + "\n"
+    (tmp_path / "plain.txt").write_text(text)
+    (tmp_path / "bom.txt").write_text(text, encoding="utf-8-sig")
+    (tmp_path / "bom.txt.gz").write_bytes(gzip.compress((tmp_path / "bom.txt").read_bytes()))
+    plain = instance_catalog.open_source(tmp_path / "plain.txt")
+    for name in ("bom.txt", "bom.txt.gz"):
+        source = instance_catalog.open_source(tmp_path / name, block)
+        assert source.count() == 4
+        assert_same_rows(read_all(source), read_all(plain), "source")
+    (tmp_path / "bom.txt").write_text("obshistid 9\n" + text, encoding="utf-8-sig")
+    assert instance_catalog.read_header(tmp_path / "bom.txt") == {"obshistid": 9}
+
+
+def test_codes_in_identifiers_are_decided_for_the_whole_catalog(tmp_path):
+    def bulges(ids):
+        return [SERSIC_TEMPLATE.format(id=number, n=4) for number in ids]
+
+    plain = read_all(write_catalog(tmp_path / "plain.txt", *bulges(range(90, 110))))
+    assert plain["id"].tolist() == list(range(90, 110))
+    assert (plain["reason"] == "").all()
+    (tmp_path / "more.txt").write_text("\n".join(bulges(range(30, 60))) + "\n")
+    included = read_all(write_catalog(tmp_path / "cat.txt", "includeobj more.txt", *bulges([97, 1024 + 97])))
+    assert included["id"].tolist() == [97, 1024 + 97, *range(30, 60)]
+    coded = [1024 * number + 97 for number in range(30)]
+    (tmp_path / "more.txt").write_text("\n".join(bulges([5, 7 * 1024 + 77])) + "\n")
+    mixed = read_all(write_catalog(tmp_path / "cat.txt", "includeobj more.txt", *bulges(coded)))
+    assert mixed["id"].tolist() == [*range(30), 5, 7]
+    assert mixed["reason"].tolist() == [""] * 30 + ["id 5 lacks the code of bulge, which the catalog has elsewhere", ""]
+
+
+def test_long_and_suffixed_identifiers_are_read(tmp_path, shared):
+    names = ("5853498713190525696_bulge", "5853498713190525697_disk")
+    lines = [SERSIC_TEMPLATE.format(id=name, n=n) for name, n in zip(names, (4, 1), strict=True)]
+    assert read_all(write_catalog(tmp_path / "cat.txt", *lines))["id"].tolist() == [
+        5853498713190525696,
+        5853498713190525697,
+    ]
+    for name, rows in (("gaia.txt", 20), ("bom.txt", 60)):
+        frame = read_all(instance_catalog.open_source(shared / "odd_inputs/instance" / name))
+        assert len(frame) == rows
+        assert (frame["reason"] == "").all()

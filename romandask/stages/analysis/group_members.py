@@ -103,8 +103,8 @@ def _with_measurements(groups: pd.DataFrame, samples: Samples, cell: int, order:
         flux = rows[f"flux_{band}"].to_numpy(float)
         true.append(pd.DataFrame({"truth_id": rows[id_column].to_numpy(np.int64), "star": star, "true_flux": flux}))
     frame = frame.merge(pd.concat(true).drop_duplicates(["truth_id", "star"]), on=["truth_id", "star"], how="left")
-    # a star and a galaxy may have the same id
-    counterpart = np.where(frame["truth_id"] >= 0, frame["truth_id"] * 2 + frame["star"], -1)
+    # a star and a galaxy may have the same id, and ids may have 63 bits: stars have negative numbers from -2 on
+    counterpart = np.where(frame["star"] & (frame["truth_id"] >= 0), -2 - frame["truth_id"], frame["truth_id"])
     names = [name for name in frame.columns if name.startswith("group_")]
     kept = [*names, "magnitude", "colour_magnitude", "half_light_radius", "true_flux"]
     return frame[kept].assign(counterpart=counterpart, blended=frame["key"].to_numpy() % CODES == samples.blended.code)
@@ -151,7 +151,7 @@ def is_real(rows: pd.DataFrame, groups: GroupCounts) -> np.ndarray:
     groups : GroupCounts
         Their groups.
     """
-    sharp = (~rows["blended"] & (rows["counterpart"] >= 0)).to_numpy()
+    sharp = (~rows["blended"] & (rows["counterpart"] != -1)).to_numpy()
     members = (
         pd.DataFrame(
             {

@@ -19,7 +19,7 @@ from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
 from romandask.stages.stage import Stage, SurveyContext
 from romandask.stages.truth.generated import GenerateGalaxies, GenerateStars, NoQuarantine, matter, templates
-from romandask.stages.truth.ingested import Assemble, Quarantine, edges_of, ingested_rows, open_sources, scan_rows
+from romandask.stages.truth.ingested import Assemble, Quarantine, edges_of, ingested_rows, open_sources, summary_of
 from romandask.stages.truth.truth_catalogs import TruthCatalogs
 from romandask.storage.arrays import write_coordinate, write_group
 from romandask.storage.manifest import digest
@@ -131,11 +131,10 @@ def _from_sources(
     store: Store | None,
     rows: TableProduct,
 ) -> TruthCatalogs:
-    summary = scan_rows(rows, settings.order)
+    summary = summary_of(rows, settings.order)
     folder = resolve_below(data, settings.seds or "seds")
     library, unusable = spectra_files.read_folder(folder, list(summary.spectra))
     edges = edges_of(rows)
-    # components of a galaxy that lie in different cells are assembled in each of them
     cells = summary.cells
     if region.area < MAX_LISTED_AREA:
         cells = np.intersect1d(cells, region.cells(settings.order, settings.margin))
@@ -149,6 +148,7 @@ def _from_sources(
             library=library,
             unusable=unusable,
             cells=cells,
+            summary=summary,
             kind=kind,
         )
         for kind in ("galaxy", "star")
@@ -163,18 +163,34 @@ def _from_sources(
     inputs = tuple((rows.stage, unit.name) for unit in rows.units)
     catalog = _catalog_factory(settings, cells, tuple(bandpasses), SOURCE_DENSITY)
     galaxies = _with_store(catalog("galaxies", makers["galaxy"], unit_settings, inputs), store)
-    per_batch = [Unit(name=unit.name, settings=unit_settings, inputs=((rows.stage, unit.name),)) for unit in rows.units]
-    per_cell = [Unit(name=f"cell-{unit.name}", settings=unit_settings, inputs=inputs) for unit in galaxies.units]
+    stars = _with_store(catalog("stars", makers["star"], unit_settings, inputs), store)
+    per_batch = [
+        Unit(
+            name=unit.name,
+            # rows of other batches make them duplicates
+            settings=unit_settings | {"duplicates": digest(summary.duplicates.get(number, np.empty(0, np.int64)))},
+            inputs=((rows.stage, unit.name),),
+        )
+        for number, unit in enumerate(rows.units)
+    ]
+    per_cell = [
+        Unit(
+            name=f"cell-{unit.name}",
+            settings=unit_settings,
+            inputs=(*inputs, (galaxies.stage, unit.name), (stars.stage, unit.name)),
+        )
+        for unit in galaxies.units
+    ]
     quarantine = TableProduct(
         stage="truth/quarantine",
         units=(*per_batch, *per_cell),
-        make=Quarantine(makers["galaxy"]),
+        make=Quarantine(makers["galaxy"], galaxies, stars),
         schema=schema("quarantine"),
         bytes_per_unit=max(rows.bytes_per_unit, galaxies.bytes_per_unit),
     )
     return TruthCatalogs(
         galaxies=galaxies,
-        stars=_with_store(catalog("stars", makers["star"], unit_settings, inputs), store),
+        stars=stars,
         quarantine=_with_store(quarantine, store),
         structure=None,
         ingested=rows,
@@ -305,7 +321,7 @@ STARS = Stage(
 QUARANTINE = Stage(
     name="truth/quarantine",
     build=lambda context, _: context.once(truth_of).quarantine,
-    reads=("truth/ingested",),
+    reads=("truth/ingested", "truth/galaxies", "truth/stars"),
     units_known_after=("truth/ingested",),
     unit="batch of rows or HEALPix cell",
     summary="Rows of source catalogs that cannot be used, each with the reason.",

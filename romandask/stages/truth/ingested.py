@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from romandask.ingest import instance_catalog, skycatalogs, table
-from romandask.ingest.rows import COMPONENTS, Batch, Source, merge_components
+from romandask.ingest.components import merge_components
+from romandask.ingest.rows import COMPONENTS, Batch, Source
 from romandask.kernels.rendering.scene import component_spectra, magnification
 from romandask.kernels.universe.dust import Dust, no_dust
 from romandask.kernels.universe.galaxy_rows import flux_columns
@@ -23,10 +24,13 @@ from romandask.products.hats import with_spatial_index
 from romandask.products.schemas import schema
 from romandask.products.tables import TableProduct
 from romandask.products.units import Unit
+from romandask.stages.truth.scan import SPECTRA, RowsSummary, scan_rows
 from romandask.storage.paths import AnyPath, access_errors_explained, resolve_below
 
-SPECTRA = ("bulge_sed", "disk_sed", "knots_sed", "sed")
-"""Columns with the names of spectra."""
+LOST_FIRST = "the first component of this galaxy cannot be used"
+"""Reason for the quarantine of components that lie in another HEALPix cell than the first one."""
+BAD_FLUX = "flux is not a number"
+"""Reason for the quarantine of an object without a finite flux in every band."""
 _BATCH_BYTES = 600 << 20
 """Peak memory of reading one batch, bytes."""
 
@@ -97,7 +101,7 @@ class _ReadBatch:
         return pd.concat([frame[~valid].assign(_healpix_29=np.int64(-1)), indexed], ignore_index=True)
 
 
-def _sources_of(rows: TableProduct) -> tuple[Source, ...]:
+def sources_of(rows: TableProduct) -> tuple[Source, ...]:
     """Return the source catalogs of ingested rows."""
     assert isinstance(rows.make, _ReadBatch)
     return rows.make.sources
@@ -105,39 +109,19 @@ def _sources_of(rows: TableProduct) -> tuple[Source, ...]:
 
 def edges_of(rows: TableProduct) -> tuple[float, ...]:
     """Return the rest-frame edges, nm, of the top-hat bins of ingested rows; empty if no row has a top-hat spectrum."""
-    return next((source.edges for source in _sources_of(rows) if source.edges), ())
+    return next((source.edges for source in sources_of(rows) if source.edges), ())
 
 
 def source_rows(rows: TableProduct) -> int:
     """Return the number of rows of the source catalogs."""
-    counts = [source.count() for source in _sources_of(rows)]
+    counts = [source.count() for source in sources_of(rows)]
     return sum(count for count in counts if count is not None)
 
 
-@dataclass(frozen=True)
-class RowsSummary:
-    """Cells and spectra of all good ingested rows."""
-
-    cells: np.ndarray
-    """HEALPix cells with rows, sorted."""
-    spectra: tuple[str, ...]
-    """Names of spectra, sorted."""
-
-
-def scan_rows(rows: TableProduct, order: int) -> RowsSummary:
-    """Return the HEALPix cells, of the given order, and the spectra of all good ingested rows.
-
-    Batches are read one at a time.
-    """
-    cells: set[int] = set()
-    names: set[str] = set()
-    for index in range(len(rows.units)):
-        frame = rows.select(index, ["_healpix_29", "reason", *SPECTRA])
-        frame = frame[frame["reason"] == ""]
-        cells |= set(np.unique(frame["_healpix_29"].to_numpy() >> (2 * (29 - order))).tolist())
-        for column in SPECTRA:
-            names |= set(frame[column].unique().tolist())
-    return RowsSummary(np.array(sorted(cells), np.int64), tuple(sorted(names - {""})))
+def summary_of(rows: TableProduct, order: int) -> RowsSummary:
+    """Return what is known only from all ingested rows together, for HEALPix cells of the given order."""
+    assert isinstance(rows.make, _ReadBatch)
+    return scan_rows(rows, order, tuple(rows.make.sources[number].components for number, _ in rows.make.pairs))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,36 +142,62 @@ class Assemble:
     """Reason why a spectrum cannot be used, by its name."""
     cells: np.ndarray
     """HEALPix cells of the partitions, nested scheme, of order `settings.order`."""
+    summary: RowsSummary
+    """What is known only from all rows together."""
     kind: str
     """Kind of the objects of the catalog: "galaxy" or "star"."""
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the rows of one partition (schema: catalogs/galaxies.yaml or catalogs/stars.yaml)."""
-        merged = self.merged(index)
+        merged = merge_components(self.rows_of(index))
         good = merged[(merged["reason"] == "") & (merged["kind"] == self.kind)]
-        inside = self.region.contains(good["ra"], good["dec"], self.settings.margin)
-        good = with_spatial_index(good[inside])
+        good = with_spatial_index(good[self.inside(good)])
         # a merged galaxy has the position of its first component, so it lies in the cell as all rows do
-        return self._galaxies(good) if self.kind == "galaxy" else self._stars(good)
+        made = self._galaxies(good) if self.kind == "galaxy" else self._stars(good)
+        fluxes = made[[name for name in made.columns if name.startswith("flux_")]].to_numpy(float)
+        return made[np.isfinite(fluxes).all(axis=1)]
 
-    def merged(self, index: int) -> pd.DataFrame:
-        """Return the rows of a cell with their reasons, after the components of each galaxy have been merged.
+    def inside(self, frame: pd.DataFrame) -> np.ndarray:
+        """Return which rows lie in the region with its margin."""
+        return np.asarray(self.region.contains(frame["ra"], frame["dec"], self.settings.margin))
 
-        Rows that are quarantined already as single rows are left out.
+    def rows_of(self, index: int) -> pd.DataFrame:
+        """Return the rows of a cell before the components of each galaxy are merged, without those that are bad alone.
+
+        All components of a galaxy are in the cell of its first row.
         """
         shift = 2 * (29 - self.settings.order)
         cell = int(self.cells[index])
-        parts = [_selected(self.rows, unit, cell << shift, (cell + 1) << shift) for unit in range(len(self.rows.units))]
-        parts = [part for part in parts if len(part)]
+        strays = self.summary.strays
+        parts = []
+        for unit in range(len(self.rows.units)):
+            own = _selected(self.rows, unit, cell << shift, (cell + 1) << shift)
+            moved = strays[strays["unit"] == unit]
+            if len(moved):
+                arriving = moved[moved["home"] == cell]
+                others = [_selected(self.rows, unit, at, at + 1) for at in arriving["_healpix_29"].unique()]
+                others = [part[part["row"].isin(arriving["row"])] for part in others]
+                own = pd.concat([own[~own["row"].isin(moved["row"])], *others], ignore_index=True)
+            if len(own):
+                # in the order of the file, of which the first row gives the position of a galaxy
+                parts.append(self.with_reasons(own, unit).sort_values("row"))
         if not parts:
-            return self.rows.empty().assign(n_rows=np.empty(0, np.int32))
+            return self.rows.empty()
         frame = pd.concat(parts, ignore_index=True)
-        frame = frame.assign(reason=self.reasons(frame))
-        return merge_components(frame[frame["reason"] == ""])
+        frame = frame[frame["reason"] == ""]
+        # a galaxy has the position of its first row, and lies in the cell of that
+        first = frame.groupby(["kind", "id"])["_healpix_29"].transform("first").to_numpy()
+        return frame.assign(reason=np.where(first >> shift == cell, "", LOST_FIRST).astype(object))
 
-    def reasons(self, frame: pd.DataFrame) -> np.ndarray:
-        """Return the reason why each row cannot be used, or "" for a good row, including faults of its spectra."""
+    def with_reasons(self, frame: pd.DataFrame, unit: int) -> pd.DataFrame:
+        """Return rows of a unit with the reason why each cannot be used.
+
+        Added to the faults of the row itself are an identifier that an earlier row has, and faults of its spectra.
+        """
         reason = frame["reason"].to_numpy(object).copy()
+        later = frame["row"].isin(self.summary.duplicates.get(unit, ())).to_numpy() & (reason == "")
+        duplicate = np.where(frame["kind"] == "galaxy", "duplicate galaxy_id", "duplicate id")
+        reason = np.where(later, duplicate, reason)
         blue = min(bandpass.wave[0] for bandpass in self.bandpasses.values())
         red = max(bandpass.wave[-1] for bandpass in self.bandpasses.values())
         library_index = self._library_index()
@@ -204,7 +214,7 @@ class Assemble:
             short[known] = (blue / stretch[known] < low) | (red / stretch[known] > high)
             bad = np.where((bad == "") & short, "spectrum does not cover the bands", bad)
             reason = np.where(reason == "", bad, reason)
-        return reason
+        return frame.assign(reason=reason)
 
     def _library_index(self) -> dict[str, int]:
         """Return the index of each spectrum of the library, by its name."""
@@ -290,23 +300,43 @@ class Assemble:
 class Quarantine:
     """Makes the quarantined rows.
 
-    The first units are the batches, with the rows that are bad in themselves; the others are the cells, with the rows
-    that contradict other rows.
+    The first units are the batches, with the rows that are bad in themselves or have the identifier of an earlier row;
+    the others are the cells, with components that contradict one another and objects without finite fluxes.
     """
 
     assemble: Assemble
     """Finds the reasons."""
+    galaxies: TableProduct
+    """Galaxies of the truth; what they lack has no finite flux."""
+    stars: TableProduct
+    """Stars of the truth."""
 
     def __call__(self, index: int) -> pd.DataFrame:
         """Return the quarantined rows of a unit (schema: catalogs/quarantine.yaml)."""
         rows = self.assemble.rows
         if index < len(rows.units):
-            frame = rows.select(index)
-            frame = frame.assign(reason=self.assemble.reasons(frame))
+            bad = self.assemble.with_reasons(rows.select(index), index)
         else:
-            frame = self.assemble.merged(index - len(rows.units))
-        bad = frame[frame["reason"] != ""]
-        return bad[["source", "row", "id", "reason"]]
+            bad = self._of_cell(index - len(rows.units))
+        return bad.loc[bad["reason"] != "", ["source", "row", "id", "reason"]]
+
+    def _of_cell(self, index: int) -> pd.DataFrame:
+        """Return the rows of a cell that contradict other rows, and those of objects without finite fluxes."""
+        rows = self.assemble.rows_of(index)
+        merged = merge_components(rows)
+        bad = merged[merged["reason"] != ""]
+        good = merged[merged["reason"] == ""]
+        good = good[self.assemble.inside(good)]
+        parts = [bad]
+        for kind, product, name in (("galaxy", self.galaxies, "galaxy_id"), ("star", self.stars, "id")):
+            ids = good.loc[good["kind"] == kind, "id"]
+            lost = ids[~ids.isin(product.select(index, [name])[name])]
+            # a merged galaxy stands for several rows
+            of_lost = rows[(rows["kind"] == kind) & rows["id"].isin(lost)].merge(
+                bad[["source", "row"]], how="left", indicator=True
+            )
+            parts.append(of_lost[of_lost["_merge"] == "left_only"].assign(reason=BAD_FLUX))
+        return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
 
 
 def _selected(rows: TableProduct, unit: int, low: int, high: int) -> pd.DataFrame:

@@ -21,6 +21,8 @@ from romandask.engine.graph import UnitGraph
 from romandask.engine.progress import Reporter
 from romandask.engine.runners import InProcess
 from romandask.export.truth import export_truth
+from romandask.ingest.rows import TEXT_COLUMNS
+from romandask.ingest.table import MAPPED_COLUMNS
 from romandask.instruments.rubin.rubin import Rubin, RubinSettings
 from romandask.model.errors import UserError
 from romandask.model.settings import TruthSettings
@@ -322,6 +324,30 @@ def test_truth_leaves_as_fits_and_hdf5(tmp_path, shared):
     (survey.store.record("truth/stars", survey.truth_catalogs.stars.names[0])).unlink()
     with pytest.raises(UserError, match="truth/stars is not all there: 1 of"):
         export_truth(Survey(survey.pipeline, survey.store), tmp_path / "again")
+
+
+@pytest.mark.slow
+def test_exported_truth_is_read_again_without_loss(tmp_path, shared):
+    instances = {"source": "instance_catalog", "path": "dc2_instance_catalog/example_instance_catalog.txt"}
+    _, survey = ingested(tmp_path / "first", shared, instances)
+    out = tmp_path / "out"
+    export_truth(survey, out)
+    tables = {}
+    for key, name, identifier in (("galaxy_table", "galaxies", "galaxy_id"), ("star_table", "stars", "id")):
+        found = fits.getdata(out / f"{name}.fits").names
+        columns = {column: column for column in MAPPED_COLUMNS if column in found} | {"id": identifier}
+        columns |= {column: f"{column}_name" for column in TEXT_COLUMNS if f"{column}_name" in found}
+        tables[key] = {"path": str(out / f"{name}.fits"), "columns": columns}
+    counts, again = ingested(tmp_path / "second", shared, {"source": "table", **tables}, out / "seds.hdf5")
+    assert counts["quarantined"] == 0
+    for name in ("galaxies", "stars"):
+        first, second = (plain(one.truth(name).compute()) for one in (survey, again))
+        spectra = [column for column in first if column == "sed" or column.endswith("_sed")]
+        for column in spectra:
+            names = [np.array([*one.truth_catalogs.library.names, ""], object) for one in (survey, again)]
+            assert (names[0][first[column]] == names[1][second[column]]).all()
+        ignored = ["n_rows", *spectra]
+        pd.testing.assert_frame_equal(first.drop(columns=ignored), second.drop(columns=ignored), rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from romandask.storage.manifest import digest
 
 FOOTPRINT_MARGIN = 2.0
 """Width by which patches are widened to find the exposures that touch them, arcsec."""
-_SECONDS = {"drizzle": (6e-8, 3e-8), "draw": (6e-7, 0.0), "warp": (2e-7, 2.5e-8)}
+_SECONDS = {"drizzle": (1.4e-7, 4.6e-8), "draw": (6e-7, 0.0), "warp": (2e-7, 2.5e-8)}
 """Time per pixel of a patch, s: without exposures, and for each exposure, which seldom covers the whole patch."""
 MAKERS: dict[str, type[TileMaker]] = {"drizzle": DrizzleTile, "draw": DrawTile, "warp": WarpTile}
 """Class that makes the tiles, by `Instrument.coadd`."""

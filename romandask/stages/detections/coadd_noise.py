@@ -94,7 +94,7 @@ def coadd_noise(coadds: Coadds) -> CoaddNoise:
         attributes={"survey": instrument.name, "pixel_scale": instrument.coadd_scale},
         # windows of the noise and the weight of a band, and the chunks that they are read from
         bytes_per_unit=280 << 20,
-        seconds_per_unit=0.2 + min(coadds.pixels, SAMPLES * SAMPLE_SIDE) ** 2 * 1.2e-7 * planes,
+        seconds_per_unit=0.2 + min(coadds.pixels, SAMPLES * SAMPLE_SIDE) ** 2 * 2.5e-7 * planes,
     )
     return CoaddNoise(product=product, bands=bands)
 

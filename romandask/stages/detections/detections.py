@@ -162,7 +162,7 @@ def detections(coadds: Coadds, noise: CoaddNoise, settings: DetectionSettings, r
         # image and weight of all bands; three planes, a mask and the limits of sep; the chunks that are decoded
         bytes_per_unit=window**2 * (8 * len(bands) + 26) + (200 << 20),
         # reading and measuring each band, and detection
-        seconds_per_unit=window**2 * (6e-8 * len(bands) + 1.2e-7),
+        seconds_per_unit=window**2 * (9e-8 * len(bands) + 1.8e-7),
         tables={"objects": schema("objects", bands)},
         patches=grid,
     )

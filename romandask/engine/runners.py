@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -122,7 +123,10 @@ class _Submitted:
         stages = {stage.product.stage: self._graph.begin_task(stage)[0] for stage in piece.stages}
         begins = {stage: key for stage, key in stages.items() if stage not in self._begun}
         keys = [self._graph.key(source) for source in piece.units()]
-        found = self._client.get(piece.high_level_graph(self._begun.keys()), [*begins.values(), *keys], sync=False)
+        with warnings.catch_warnings():
+            # a piece of a graph is large, and that is known
+            warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+            found = self._client.get(piece.high_level_graph(self._begun.keys()), [*begins.values(), *keys], sync=False)
         self._begun |= dict(zip(begins, found[: len(begins)], strict=True))
         for key, future in zip(keys, found[len(begins) :], strict=True):
             self.futures[key] = future

@@ -2,6 +2,7 @@
 
 import io
 
+import cloudpickle
 import pytest
 from conftest import MINI
 from distributed import Client, LocalCluster
@@ -40,7 +41,7 @@ def test_the_graph_has_a_layer_for_each_stage_and_an_edge_for_each_input(tmp_pat
     survey = survey_in(tmp_path / "store")
     graph = survey.graph()
     layers = graph.__dask_graph__().layers
-    assert len(layers) == sum(len(survey.product(one.name).units) > 0 for one in stage_products(survey))
+    assert len(layers) - 1 == sum(len(survey.product(one.name).units) > 0 for one in stage_products(survey))
     assert not (tmp_path / "store").exists(), "nothing is written before the graph is computed"
     graph.__dask_graph__().validate()
     low_level = graph.__dask_graph__().to_dict()
@@ -49,7 +50,15 @@ def test_the_graph_has_a_layer_for_each_stage_and_an_edge_for_each_input(tmp_pat
         for name in stage.tasks:
             read = {graph.key(source) for source in (*units[name].inputs, *units[name].optional)}
             needed = low_level[graph.key((stage.product.stage, name))].dependencies
-            assert {key for key in needed if not key[0].startswith("begin-")} == read, name
+            assert {key for key in needed if not key[0].startswith(("begin-", "products-"))} == read, name
+
+
+def test_the_products_of_a_graph_share_what_they_are_made_from_in_a_worker(tmp_path):
+    """A copy of each, with all that is upstream, would fill a worker of a large survey."""
+    graph = survey_in(tmp_path / "store").graph()
+    assert len(graph.part(set(graph.units()[:1]), {}).products.by_stage) == len(graph.stages), "those of all parts"
+    together = len(cloudpickle.dumps(graph.products))
+    assert together < 0.2 * sum(len(cloudpickle.dumps(product)) for product in graph.products.by_stage.values())
 
 
 @pytest.mark.slow

@@ -28,6 +28,8 @@ GROUP = 200
 """Number of units whose end is awaited by one task, so that no task has thousands of dependencies."""
 Key = tuple[str, str]
 """Key of a dask task: name of the layer, and name of the unit."""
+PRODUCTS = "products"
+"""Name of the layer whose only task returns all products of a graph."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +45,17 @@ class StageUnits:
     """True if no stage reads this one: its units are made when workers have nothing else to do."""
     finish: Callable[[Product, Store], None] | None = None
     """Writes the files of the stage that belong to no unit, when all units are stored; must be picklable."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """The products of the stages of a graph.
+
+    They share what they are made from: together they take a tenth of the memory of a worker that copies of each, with
+    all that is upstream, would take.
+    """
+
+    by_stage: Mapping[str, Product]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +75,8 @@ class UnitGraph(DaskMethodsMixin):
     """Futures of the tasks of a persisted collection."""
     token: str = field(default_factory=lambda: f"0{uuid.uuid4().hex[:7]}")
     """Part of the keys of the tasks. It begins with a digit, so that dask leaves it out of the names of task groups."""
+    whole: Products | None = None
+    """Products of the graph of which this one is a part."""
 
     @classmethod
     def of(cls, product: Product, store: Store) -> UnitGraph:
@@ -87,19 +102,30 @@ class UnitGraph(DaskMethodsMixin):
         """Return the key of the task of a unit."""
         return self.layer(source[0]), source[1]
 
+    @property
+    def products(self) -> Products:
+        """Products of all stages, and of those of the graph of which this one is a part."""
+        return self.whole or Products({stage.product.stage: stage.product for stage in self.stages})
+
+    def products_task(self) -> tuple[Key, DaskTask]:
+        """Return the task that returns the products, which all others need."""
+        key = (self.layer(PRODUCTS), "all")
+        return key, DaskTask(key, _held, self.products)
+
     def unit_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
         """Yield the tasks of the units of a stage by key."""
-        product = TaskRef(("begin-" + self.layer(stage.product.stage), "product"))
-        for name, task in stage.tasks.items():
-            key = self.key((stage.product.stage, name))
-            inputs = [TaskRef(self.key(source)) for source in stage.sources[name]]
+        name = stage.product.stage
+        products, begun = TaskRef(self.products_task()[0]), TaskRef(self.begin_task(stage)[0])
+        for unit, task in stage.tasks.items():
+            key = self.key((name, unit))
+            inputs = [TaskRef(self.key(source)) for source in stage.sources[unit]]
             # a data producer is sent to a worker only when the worker has a free thread: see docs/developer/run.md
-            yield key, DaskTask(key, make_unit, product, task, self.store, *inputs, _data_producer=True)
+            yield key, DaskTask(key, _make, products, begun, task, self.store, *inputs, _data_producer=True)
 
     def begin_task(self, stage: StageUnits) -> tuple[Key, DaskTask]:
-        """Return the task that prepares the arrays of a stage and returns its product, which its units need."""
-        key = ("begin-" + self.layer(stage.product.stage), "product")
-        return key, DaskTask(key, begin_stage, stage.product, self.store)
+        """Return the task that prepares the arrays of a stage and returns its name, which its units need."""
+        key = ("begin-" + self.layer(stage.product.stage), "arrays")
+        return key, DaskTask(key, _begin, TaskRef(self.products_task()[0]), stage.product.stage, self.store)
 
     def end_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
         """Yield the tasks that write the files of a stage after its last unit; the last one is the end of the stage."""
@@ -112,8 +138,8 @@ class UnitGraph(DaskMethodsMixin):
             for key, group in zip(waiting, groups, strict=True):
                 yield key, DaskTask(key, _all_made, *map(TaskRef, group))
             level += 1
-        key, begun = ("end-" + self.layer(name), "files"), self.begin_task(stage)[0]
-        yield key, DaskTask(key, _finish, stage.finish, TaskRef(begun), self.store, *map(TaskRef, waiting))
+        key, needed = ("end-" + self.layer(name), "files"), (self.products_task()[0], self.begin_task(stage)[0])
+        yield key, DaskTask(key, _finish, stage.finish, self.store, *map(TaskRef, (*needed, *waiting)))
 
     def __dask_graph__(self) -> HighLevelGraph | Mapping[Key, Any]:
         return self.high_level_graph() if self.futures is None else self.futures
@@ -124,10 +150,13 @@ class UnitGraph(DaskMethodsMixin):
         Parameters
         ----------
         begun : set of str
-            Stages whose first task (`begin_task`) was submitted before.
+            Stages whose first task (`begin_task`) was submitted before, and PRODUCTS if the task of the products was.
         """
         layers: dict[str, MaterializedLayer] = {}
         dependencies: dict[str, set[str]] = {}
+        products = self.layer(PRODUCTS)
+        if PRODUCTS not in begun:
+            layers[products], dependencies[products] = MaterializedLayer(dict([self.products_task()])), set()
         for stage in self.stages:
             name = self.layer(stage.product.stage)
             tasks = dict(self.unit_tasks(stage))
@@ -137,7 +166,7 @@ class UnitGraph(DaskMethodsMixin):
                 tasks |= dict(self.end_tasks(stage))
             layers[name] = MaterializedLayer(tasks, annotations={"retries": RETRIES, "priority": -int(stage.last)})
             read = {source[0] for sources in stage.sources.values() for source in sources}
-            dependencies[name] = {self.layer(other) for other in read} - {name}
+            dependencies[name] = {products, *(self.layer(other) for other in read)} - {name}
         present = set(layers)
         return HighLevelGraph(layers, {name: needed & present for name, needed in dependencies.items()})
 
@@ -183,7 +212,7 @@ class UnitGraph(DaskMethodsMixin):
                 tasks = {name: task for name, (task, _) in known.items()}
                 sources = {name: waiting for name, (_, waiting) in known.items()}
                 stages.append(replace(stage, tasks=tasks, sources=sources))
-        return replace(self, stages=stages)
+        return replace(self, stages=stages, whole=self.products)
 
     def __dask_keys__(self) -> list[Key]:
         ends = [
@@ -192,7 +221,7 @@ class UnitGraph(DaskMethodsMixin):
         return [*map(self.key, self.units()), *ends]
 
     def __dask_layers__(self) -> tuple[str, ...]:
-        return tuple(self.layer(stage.product.stage) for stage in self.stages)
+        return (self.layer(PRODUCTS), *(self.layer(stage.product.stage) for stage in self.stages))
 
     def __dask_tokenize__(self) -> str:
         return self.token
@@ -224,8 +253,8 @@ def _with_outputs(
 _BEGIN = threading.Lock()
 
 
-def begin_stage(product: Product, store: Store) -> Product:
-    """Create the arrays of a product in a store and return the product.
+def begin_stage(product: Product, store: Store) -> None:
+    """Create the arrays of a product in a store.
 
     It may be called again while units are written, when the worker that had the result is lost: what exists and is
     right is not written again.
@@ -233,16 +262,28 @@ def begin_stage(product: Product, store: Store) -> Product:
     with _BEGIN:
         remove_checksums(store, product.stage)
         product.prepare(store)
-    return product
+
+
+def _held(products: Products) -> Products:
+    return products
+
+
+def _begin(products: Products, stage: str, store: Store) -> str:
+    begin_stage(products.by_stage[stage], store)
+    return stage
+
+
+def _make(products: Products, stage: str, task: Task, store: Store, *inputs: UnitResult) -> UnitResult:
+    return make_unit(products.by_stage[stage], task, store, *inputs)
 
 
 def _all_made(*units: Any) -> int:
     return len(units)
 
 
-def _finish(finish: Callable[[Product, Store], None], product: Product, store: Store, *made: Any) -> str:
-    finish(product, store)
-    return product.stage
+def _finish(finish: Callable[[Product, Store], None], store: Store, products: Products, stage: str, *made: Any) -> str:
+    finish(products.by_stage[stage], store)
+    return stage
 
 
 def _persisted(graph: UnitGraph, futures: Mapping[Key, Any], rename: Any = None) -> UnitGraph:

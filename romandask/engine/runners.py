@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from typing import Any, Protocol
 
-from romandask.engine.graph import Key, StageUnits, UnitGraph, begin_stage
+from romandask.engine.graph import PRODUCTS, Key, StageUnits, UnitGraph, begin_stage
 from romandask.engine.lost_units import Lost, watched_workers
 from romandask.engine.staleness import Source
 from romandask.engine.task import UnitResult, make_unit
@@ -68,7 +68,8 @@ class InProcess:
         """Make units, one stage after another, and yield the end of each. A failed unit is not tried again."""
         results: dict[Source, UnitResult] = {}
         for stage in graph.stages:
-            product = begin_stage(stage.product, graph.store)
+            product = stage.product
+            begin_stage(product, graph.store)
             for name in _after_their_sources(product.stage, stage):
                 source, needed = (product.stage, name), stage.sources[name]
                 if any(other not in results for other in needed):
@@ -109,7 +110,7 @@ class _Submitted:
         self.futures: dict[Any, Any] = {}
         """Futures of the units that have not ended, by key."""
         self._begun: dict[str, Any] = {}
-        """Futures of the products of the stages of which units were submitted."""
+        """Futures of the products, and of the first tasks of the stages of which units were submitted."""
         self._outputs: dict[Source, str] = {}
         self._not_made: set[Source] = set()
 
@@ -121,6 +122,7 @@ class _Submitted:
             self._not_made |= skipped
             piece = piece.part(units - skipped, {})
         stages = {stage.product.stage: self._graph.begin_task(stage)[0] for stage in piece.stages}
+        stages[PRODUCTS] = self._graph.products_task()[0]
         begins = {stage: key for stage, key in stages.items() if stage not in self._begun}
         keys = [self._graph.key(source) for source in piece.units()]
         with warnings.catch_warnings():

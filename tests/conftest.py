@@ -104,12 +104,12 @@ def mini_store(tmp_path_factory, worker_id) -> Path:
 
 
 LONG = (
-    "test_memory.py",
     "test_survey.py",
+    "test_sca_readout.py",
     "test_run.py",
     "test_object_store.py",
-    "test_sca_readout.py",
     "test_draw_accuracy.py",
+    "test_memory.py",
     "test_code_rules.py",
     "test_main.py",
     "test_verify.py",

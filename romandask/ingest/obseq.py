@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
+from romandask.ingest.units import factor_to
 from romandask.ingest.visits import bands_of, check_all_bands, check_ranges, modified_julian, numbers_of
 from romandask.model.errors import UserError
 from romandask.model.filters import ROMAN
@@ -171,13 +172,9 @@ def _series(column: Table.Column, path: AnyPath, name: str) -> pd.Series:
 def _factor(text: str, unit: u.UnitBase, path: AnyPath, column: str) -> float:
     """Return the factor from the unit of a column of the file to ours."""
     text = text.strip()
-    if not text:
-        return 1.0
-    for spelling in (text, text.lower(), SPELLINGS.get(text.lower(), text)):
-        try:
-            return float(u.Unit(spelling).to(unit))
-        except (ValueError, TypeError, u.UnitConversionError):
-            continue
-    raise UserError(
-        f"{path}: column {column!r} is in {text!r} (TUNIT), which is not a unit of it: convert it to {unit}"
-    )
+    factor = factor_to((unit,), text, SPELLINGS) if text else 1.0
+    if factor is None:
+        raise UserError(
+            f"{path}: column {column!r} is in {text!r} (TUNIT), which is not a unit of it: convert it to {unit}"
+        )
+    return factor

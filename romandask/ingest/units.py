@@ -1,8 +1,9 @@
-"""Units of the columns of source catalogs: those that a file gives are converted to romandask's, or refused."""
+"""Units of the columns of files: those that a file gives are converted to romandask's, or refused."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 
 import astropy.units as u
 from astropy.units.function import FunctionUnitBase
@@ -52,9 +53,10 @@ def factors(path: AnyPath, columns: dict[str, str], units: dict[str, str]) -> di
         text = units.get(columns.get(name, ""), "").strip()
         if text.lower() in _NONE:
             continue
-        factor = _factor(text, unit_of(name))
+        unit = unit_of(name)
+        factor = factor_to((unit, unit * u.ph), text, _SPELLINGS)
         if factor is None:
-            wanted = unit_of(name).to_string() or "no unit"
+            wanted = unit.to_string() or "no unit"
             raise UserError(
                 f"{path}: column {columns[name]!r} (for {name}) has the unit {text!r}, expected {wanted} or a unit "
                 "that astropy converts to it: convert the column, or correct its unit"
@@ -64,11 +66,26 @@ def factors(path: AnyPath, columns: dict[str, str], units: dict[str, str]) -> di
     return out
 
 
-def _factor(text: str, wanted: u.UnitBase) -> float | None:
-    """Return the factor from a unit to another, or None if there is none."""
+def factor_to(wanted: Sequence[u.UnitBase], text: str, spellings: Mapping[str, str]) -> float | None:
+    """Return the factor from the unit of a file to the first of some units that it is equivalent to.
+
+    Parameters
+    ----------
+    wanted : sequence of Unit
+        Units to convert to.
+    text : str
+        Unit as the file has it.
+    spellings : mapping
+        Units by the spellings, in small letters, that astropy does not know.
+
+    Returns
+    -------
+    float or None
+        The factor; None if there is none.
+    """
     # astropy does not know 1/s/cm2, but 1/(s cm2)
     inverse = f"1/({text[2:].replace('/', ' ')})" if text.startswith("1/") else ""
-    for spelling in (text, text.lower(), inverse, _SPELLINGS.get(text.lower(), "")):
+    for spelling in (text, text.lower(), inverse, spellings.get(text.lower(), "")):
         try:
             with warnings.catch_warnings():
                 # a unit with two slashes, for example
@@ -77,8 +94,8 @@ def _factor(text: str, wanted: u.UnitBase) -> float | None:
         except (ValueError, TypeError):
             continue
         if isinstance(unit, FunctionUnitBase):
-            return 1.0 if wanted == u.mag and unit == u.ABmag else None
-        for other in (wanted, wanted * u.ph):
+            return 1.0 if u.mag in wanted and unit == u.ABmag else None
+        for other in wanted:
             if spelling and unit.is_equivalent(other):
                 return float(unit.to(other))
     return None

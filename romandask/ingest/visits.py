@@ -90,7 +90,8 @@ def check_all_bands(texts: pd.Series, rows: pd.Series, bands: Collection[str], w
     UserError
         If a band has no rows; names the filters that have some.
     """
-    absent = [band for band in bands if band not in set(rows)]
+    present = set(rows.unique())
+    absent = [band for band in bands if band not in present]
     if absent:
         counts = ", ".join(f"{name} ({count} rows)" for name, count in texts.value_counts().items())
         raise UserError(

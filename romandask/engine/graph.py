@@ -107,25 +107,24 @@ class UnitGraph(DaskMethodsMixin):
         """Products of all stages, and of those of the graph of which this one is a part."""
         return self.whole or Products({stage.product.stage: stage.product for stage in self.stages})
 
-    def products_task(self) -> tuple[Key, DaskTask]:
-        """Return the task that returns the products, which all others need."""
-        key = (self.layer(PRODUCTS), "all")
-        return key, DaskTask(key, _held, self.products)
+    @property
+    def products_key(self) -> Key:
+        """Key of the task that returns the products, which all others need."""
+        return self.layer(PRODUCTS), "all"
+
+    def begin_key(self, stage: str) -> Key:
+        """Return the key of the task that prepares the arrays of a stage and returns its name, which its units need."""
+        return f"begin-{self.layer(stage)}", "arrays"
 
     def unit_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
         """Yield the tasks of the units of a stage by key."""
         name = stage.product.stage
-        products, begun = TaskRef(self.products_task()[0]), TaskRef(self.begin_task(stage)[0])
+        products, begun = TaskRef(self.products_key), TaskRef(self.begin_key(name))
         for unit, task in stage.tasks.items():
             key = self.key((name, unit))
             inputs = [TaskRef(self.key(source)) for source in stage.sources[unit]]
             # a data producer is sent to a worker only when the worker has a free thread: see docs/developer/run.md
             yield key, DaskTask(key, _make, products, begun, task, self.store, *inputs, _data_producer=True)
-
-    def begin_task(self, stage: StageUnits) -> tuple[Key, DaskTask]:
-        """Return the task that prepares the arrays of a stage and returns its name, which its units need."""
-        key = ("begin-" + self.layer(stage.product.stage), "arrays")
-        return key, DaskTask(key, _begin, TaskRef(self.products_task()[0]), stage.product.stage, self.store)
 
     def end_tasks(self, stage: StageUnits) -> Iterator[tuple[Key, DaskTask]]:
         """Yield the tasks that write the files of a stage after its last unit; the last one is the end of the stage."""
@@ -138,8 +137,8 @@ class UnitGraph(DaskMethodsMixin):
             for key, group in zip(waiting, groups, strict=True):
                 yield key, DaskTask(key, _all_made, *map(TaskRef, group))
             level += 1
-        key, needed = ("end-" + self.layer(name), "files"), (self.products_task()[0], self.begin_task(stage)[0])
-        yield key, DaskTask(key, _finish, stage.finish, self.store, *map(TaskRef, (*needed, *waiting)))
+        key, needed = ("end-" + self.layer(name), "files"), (self.products_key, self.begin_key(name), *waiting)
+        yield key, DaskTask(key, _finish, stage.finish, self.store, *map(TaskRef, needed))
 
     def __dask_graph__(self) -> HighLevelGraph | Mapping[Key, Any]:
         return self.high_level_graph() if self.futures is None else self.futures
@@ -150,18 +149,23 @@ class UnitGraph(DaskMethodsMixin):
         Parameters
         ----------
         begun : set of str
-            Stages whose first task (`begin_task`) was submitted before, and PRODUCTS if the task of the products was.
+            Stages whose first task (`begin_key`) was submitted before, and PRODUCTS if the task of the products was.
         """
         layers: dict[str, MaterializedLayer] = {}
         dependencies: dict[str, set[str]] = {}
         products = self.layer(PRODUCTS)
         if PRODUCTS not in begun:
-            layers[products], dependencies[products] = MaterializedLayer(dict([self.products_task()])), set()
+            key = self.products_key
+            layers[products], dependencies[products] = (
+                MaterializedLayer({key: DaskTask(key, _held, self.products)}),
+                set(),
+            )
         for stage in self.stages:
             name = self.layer(stage.product.stage)
             tasks = dict(self.unit_tasks(stage))
             if stage.product.stage not in begun:
-                tasks |= dict([self.begin_task(stage)])
+                key = self.begin_key(stage.product.stage)
+                tasks[key] = DaskTask(key, _begin, TaskRef(self.products_key), stage.product.stage, self.store)
             if stage.finish is not None:
                 tasks |= dict(self.end_tasks(stage))
             layers[name] = MaterializedLayer(tasks, annotations={"retries": RETRIES, "priority": -int(stage.last)})

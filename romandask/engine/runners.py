@@ -121,8 +121,8 @@ class _Submitted:
         if skipped:
             self._not_made |= skipped
             piece = piece.part(units - skipped, {})
-        stages = {stage.product.stage: self._graph.begin_task(stage)[0] for stage in piece.stages}
-        stages[PRODUCTS] = self._graph.products_task()[0]
+        stages = {stage.product.stage: self._graph.begin_key(stage.product.stage) for stage in piece.stages}
+        stages[PRODUCTS] = self._graph.products_key
         begins = {stage: key for stage, key in stages.items() if stage not in self._begun}
         keys = [self._graph.key(source) for source in piece.units()]
         with warnings.catch_warnings():
